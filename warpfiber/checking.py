@@ -1,0 +1,101 @@
+"""What `warpfiber check` prints: numbers that follow from a scene without running it."""
+
+from __future__ import annotations
+
+from warpfiber.methods.bead_chain import LIST_SKIN, contact_reach
+from warpfiber.methods.stability import chosen_step, step_limits
+from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.derived import (
+    bead_count,
+    crowding,
+    effective_stiffness,
+    equivalent_aspect_ratio,
+    jeffery_period,
+    node_count,
+    reynolds_number,
+    segment_count,
+    total_strain,
+)
+
+# Measured on cells of the shipped scenes: listed pairs per segment stay below the capacity of 4.
+_BYTES_PER_PAIR = 4 * 7 + 8 * 11
+_BYTES_PER_SEGMENT = 4 * 3 * 24 + 120
+_BYTES_PER_NODE = 8 * 3 * 4
+
+
+def _number(value: float | None, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.4g} {unit}".rstrip()
+
+
+def memory_bytes(scene: Scene) -> float:
+    """Bytes of the arrays of a run, before its lists grow."""
+    real = 0.5 if scene.numerics.precision == "float32" else 1.0
+    nodes = sum(node_count(group) for group in scene.fibers)
+    segments = sum(segment_count(group) for group in scene.fibers)
+    size = nodes * _BYTES_PER_NODE * real
+    if contact_reach(scene) > 0.0:
+        size += segments * (_BYTES_PER_SEGMENT + 4 * _BYTES_PER_PAIR * real)
+    return size
+
+
+def record_bytes(scene: Scene) -> float:
+    """Bytes of `run.vtkhdf`."""
+    frames = scene.record.frames or 100
+    nodes = sum(node_count(group) for group in scene.fibers)
+    fibers = sum(group.count for group in scene.fibers)
+    return frames * 12.0 * (nodes * (1 + len(scene.record.node_fields)) + fibers)
+
+
+def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str, str]]:
+    head = f"fibers.{index}"
+    if group.node_file is not None:
+        return [(head, f"read from {group.node_file}")]
+    rows = [
+        (f"{head} count", f"{group.count}"),
+        ("aspect ratio r_f", _number(group.aspect_ratio)),
+        ("volume fraction V_f (asked)", _number(group.volume_fraction_achieved)),
+        ("V_f r_f (> 1: reduced = unreduced)", _number(crowding(scene, group))),
+        ("effective stiffness S_eff (<< 0.04 bends)", _number(effective_stiffness(scene, group))),
+        ("Reynolds number of a bead", _number(reynolds_number(scene, group))),
+        ("equivalent aspect ratio r_e", _number(equivalent_aspect_ratio(scene, group))),
+        ("Jeffery period", _number(jeffery_period(scene, group), "s")),
+        ("segments per fiber N_seg", f"{group.segments}"),
+        ("reduced beads per segment N_R", _number(group.bead_spacing - 1.0)),
+        (
+            "nodes / segments / beads",
+            f"{node_count(group)} / {segment_count(group)} / {bead_count(group):.6g}",
+        ),
+    ]
+    if group.volume_fraction is not None:
+        name, value = rows[2]
+        rows[2] = (name, f"{value} ({group.volume_fraction:.4g})")
+    if scene.box is not None:
+        edges = " x ".join(f"{group.length / edge:.3g}" for edge in scene.box.size)
+        rows.append(("fiber length / box edges", edges))
+    return rows
+
+
+def check_lines(scene: Scene) -> list[str]:
+    """The report, one line per number."""
+    rows: list[tuple[str, str]] = []
+    for index, group in enumerate(scene.fibers):
+        rows += _group_lines(scene, index, group)
+    rows.append(("total strain", _number(total_strain(scene))))
+    if not any(group.node_file for group in scene.fibers):
+        limits, dt = step_limits(scene), chosen_step(scene)
+        for limit in limits:
+            rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
+        share = dt / limits[0].dt
+        rows.append(("dt", f"{dt:.4g} s = {share:.3g} of the limit set by {limits[0].term}"))
+        strain = total_strain(scene)
+        if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
+            rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
+    if contact_reach(scene) > 0.0:
+        skin = scene.numerics.skin
+        text = f"auto, {LIST_SKIN} diameters" if skin is None else f"{skin:.3g} m"
+        rows.append(("neighbor list skin", text))
+    rows.append(("memory of the arrays", f"{memory_bytes(scene) / 1e6:.3g} MB"))
+    if scene.record.trajectory:
+        rows.append(("size of the record", f"{record_bytes(scene) / 1e6:.3g} MB"))
+    width = max(len(name) for name, _ in rows)
+    return [f"{name:<{width}}  {value}" for name, value in rows]

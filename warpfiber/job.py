@@ -1,0 +1,374 @@
+"""A simulation run into a result folder: stages, records, checkpoints, clean stops, resume.
+
+Events (rows, frames, ends of stages) happen at the first step that reaches their strain or time, so
+a resumed run records the same rows as an uninterrupted one. A stop (Ctrl-C, SIGTERM, SIGUSR1, wall
+limit) ends the loop after the step under way and writes a checkpoint; a diverged run writes its
+last good state and, beside it, the bad one.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpfiber.output.checkpoint import latest_checkpoint, read_checkpoint, write_checkpoint
+from warpfiber.output.folder import RecordError, ResultFolder
+from warpfiber.output.scalars import ScalarsWriter
+from warpfiber.output.trajectory import TrajectoryWriter
+from warpfiber.scene import Scene, Stage, scene_from_dict
+from warpfiber.simulation import Diverged, Simulation
+from warpfiber.stopping import Stopper
+from warpfiber.summary import Summary, versions
+
+LOOK_EVERY = 0.2  # s of wall time between looks at stop requests and the progress line
+PROFILE_STEPS = 5
+
+
+class Job:
+    """One run of a scene into one folder; `resume` continues a stopped one."""
+
+    def __init__(
+        self, simulation: Simulation, folder: ResultFolder, *, progress: Any = None
+    ) -> None:
+        self.simulation, self.folder = simulation, folder
+        self.scene: Scene = simulation.scene
+        self.progress = progress
+        self.stages = self.scene.stage_sequence
+        self.stage_index = 0
+        self.stage_start = (0.0, 0.0)  # strain and time where the stage began
+        self.row_index = 0
+        self.frame_index = 0
+        self.last_row: dict[str, float] = {}
+        self.good: dict[str, np.ndarray] = {}
+        self.good_attrs: dict[str, Any] = {}
+        self.summary = Summary(simulation)
+        self.scalars: ScalarsWriter
+        self.trajectory: TrajectoryWriter | None = None
+        self.passes: dict[str, list[float]] = {}
+
+    # -- starting ---------------------------------------------------------------------------------
+
+    @classmethod
+    def start(
+        cls,
+        scene: Scene,
+        *,
+        out: str | Path | None = None,
+        overwrite: bool = False,
+        device: str | None = None,
+        workers: int | None = None,
+        progress: Any = None,
+    ) -> Job:
+        """Build the scene, then make the folder: nothing is written if the scene has a fault."""
+        simulation = Simulation(scene, device=device, workers=workers)
+        folder = ResultFolder.create(out, scene.name, overwrite)
+        job = cls(simulation, folder, progress=progress)
+        folder.write_scene(job.scene.as_dict())
+        folder.log(f"warpfiber {versions()['warpfiber']}: {job.scene.path}, {job.describe()}")
+        for note in job.scene.notes:
+            folder.log(f"note: {note}")
+        row = simulation.measure()
+        job.scalars = ScalarsWriter(folder.scalars_path, list(row))
+        if job.scene.record.trajectory:
+            job.trajectory = TrajectoryWriter(
+                folder.trajectory_path,
+                fiber_node_start=simulation.fiber_node_start,
+                fiber_group=simulation.model.host["fiber_group"],
+                scene_json=json.dumps(job.scene.as_dict()),
+                attrs=job._attrs(),
+                node_fields=job.scene.record.node_fields,
+            )
+        return job
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | Path,
+        *,
+        device: str | None = None,
+        workers: int | None = None,
+        progress: Any = None,
+    ) -> Job:
+        """Continue from the latest checkpoint of a folder. Raises SceneError, RecordError."""
+        folder = ResultFolder.open(path)
+        checkpoint = latest_checkpoint(folder.path)
+        if checkpoint is None:
+            raise RecordError(f"{folder.path}: no checkpoint to resume from")
+        arrays, attrs = read_checkpoint(checkpoint)
+        scene = scene_from_dict(json.loads(attrs["scene"]))
+        simulation = Simulation(
+            scene, device=device or attrs["device"], workers=workers, placement=_placement(arrays)
+        )
+        simulation.restore(arrays)
+        job = cls(simulation, folder, progress=progress)
+        job.stage_index = int(attrs["stage_index"])
+        job.stage_start = (float(attrs["stage_strain"]), float(attrs["stage_time"]))
+        job.row_index, job.frame_index = int(attrs["row_index"]), int(attrs["frame_index"])
+        job.summary.wall_before = float(attrs["wall_seconds"])
+        step = simulation.step_count
+        job.scalars = ScalarsWriter.reopen(folder.scalars_path, step)
+        if scene.record.trajectory:
+            job.trajectory = TrajectoryWriter.reopen(folder.trajectory_path, step)
+        folder.log(f"resumed at step {step} from {checkpoint.name}")
+        return job
+
+    def describe(self) -> str:
+        """One line: counts, dt and what limits it."""
+        model, limit = self.simulation.model, self.simulation.limits[0]
+        return (
+            f"{model.fiber_count} fibers, {model.segment_count} segments, "
+            f"dt {self.simulation.dt:.4g} s (limit {limit.dt:.4g} s, {limit.term}), "
+            f"{self.scene.numerics.precision} on {self.simulation.device}, "
+            f"workers {self.simulation.method.workers}"
+        )
+
+    # -- the loop ---------------------------------------------------------------------------------
+
+    def run(self, *, max_wall: float | None = None) -> int:
+        """Run to the end of the last stage; returns the exit code (0, 3, 130 or 143)."""
+        code = 0
+        with Stopper(max_wall) as stopper:
+            try:
+                self.simulation.method.prepare()
+                self.summary.begin()
+                self._record_due()
+                self._keep_good()
+                while self.stage_index < len(self.stages) and not stopper.reason:
+                    code = self._advance_to_event(stopper)
+                    if code:
+                        break
+                if stopper.reason and not code:
+                    self.folder.log(f"stopped by {stopper.reason}")
+                    code = stopper.exit_code
+            except Diverged as torn:
+                code = self._diverged(torn)
+            else:
+                self._write_checkpoint(self.simulation.snapshot(), self._position())
+            finally:
+                self._close()
+        outcome = {0: "finished", 3: "diverged", 130: "interrupted", 143: "stopped"}[code]
+        self.folder.write_summary(self.summary.as_dict(self, outcome))
+        self.folder.log(f"{outcome} at step {self.simulation.step_count}")
+        return code
+
+    def _advance_to_event(self, stopper: Stopper) -> int:
+        """Run until the next row, frame or end of stage is due, or a stop is asked for."""
+        stage = self.stages[self.stage_index]
+        simulation = self.simulation
+        while not stopper.reason:
+            steps = min(self._steps_to_events(stage))
+            if steps <= 0:
+                break
+            begin = time.perf_counter()
+            before = simulation.step_count
+            simulation.step(min(steps, self.summary.steps_within(LOOK_EVERY)))
+            self.summary.add(simulation.step_count - before, time.perf_counter() - begin)
+            self._show_progress()
+            if self._past_time_limit(stage):
+                return 3
+            self._checkpoint_if_due()
+        if stopper.reason:
+            return 0
+        self._record_due()
+        if self._stage_steps(stage) <= 0:
+            self._end_stage(stage)
+        return 0
+
+    def _steps_to_events(self, stage: Stage) -> list[int]:
+        row = self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
+        frame = self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
+        return [
+            self._stage_steps(stage),
+            self.simulation.steps_to(*row),
+            self.simulation.steps_to(*frame),
+        ]
+
+    def _stage_steps(self, stage: Stage) -> int:
+        strain = None if stage.end_strain is None else self.stage_start[0] + stage.end_strain
+        moment = None if stage.end_time is None else self.stage_start[1] + stage.end_time
+        return self.simulation.steps_to(strain, moment)
+
+    def _event_mark(
+        self, stage: Stage, index: int, interval: tuple[str, float]
+    ) -> tuple[float | None, float | None]:
+        kind, width = interval
+        if kind == "strain":
+            return self.stage_start[0] + index * width, None
+        return None, self.stage_start[1] + index * width
+
+    def _row_interval(self, stage: Stage) -> tuple[str, float]:
+        return self._share(stage, self.scene.record.scalars)
+
+    def _frame_interval(self, stage: Stage) -> tuple[str, float]:
+        record = self.scene.record
+        if record.every_strain is not None:
+            return "strain", record.every_strain
+        if record.every_time is not None:
+            return "time", record.every_time
+        return self._share(stage, record.frames or 100)
+
+    def _share(self, stage: Stage, count: int) -> tuple[str, float]:
+        """`count` even parts of the whole run, in strain where the stages end by strain."""
+        ends = [s.end_strain for s in self.stages]
+        if stage.end_strain is not None:
+            return "strain", sum(e for e in ends if e is not None) / count
+        times = [s.end_time for s in self.stages]
+        return "time", sum(t for t in times if t is not None) / count
+
+    def _end_stage(self, stage: Stage) -> None:
+        self.folder.log(f"stage '{stage.name}' ended at strain {self.simulation.strain:.6g}")
+        self.stage_index += 1
+        self.stage_start = (self.simulation.strain, self.simulation.time)
+        self.row_index = self.frame_index = 0
+        if self.stage_index < len(self.stages):
+            self._write_checkpoint(self.simulation.snapshot(), self._position())
+
+    def _past_time_limit(self, stage: Stage) -> bool:
+        limit = stage.time_limit
+        if limit is None or self.simulation.time - self.stage_start[1] < limit:
+            return False
+        self.folder.log(f"stage '{stage.name}': end condition not met within {limit} s")
+        return True
+
+    # -- recording --------------------------------------------------------------------------------
+
+    def _record_due(self) -> None:
+        """Write the row and the frame whose marks have been reached (and those of the start)."""
+        simulation = self.simulation
+        if self.stage_index >= len(self.stages):
+            return
+        stage = self.stages[self.stage_index]
+        begin = time.perf_counter()
+        first = simulation.step_count == 0 and self.stage_index == 0
+        row_due = simulation.steps_to(
+            *self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
+        )
+        frame_due = simulation.steps_to(
+            *self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
+        )
+        if first or row_due <= 0:
+            row = simulation.measure()
+            self.scalars.append(row)
+            self.last_row = row
+            self.summary.look_at(row)
+            self.row_index += 0 if first else 1
+        if first or frame_due <= 0:
+            self._write_frame()
+            self.frame_index += 0 if first else 1
+            if not first:
+                self._profile(stage)
+        self.summary.recording_seconds += time.perf_counter() - begin
+        if first or row_due <= 0:
+            self._keep_good()
+
+    def _write_frame(self) -> None:
+        if self.trajectory is None:
+            return
+        simulation = self.simulation
+        fields = {}
+        if "velocity" in self.scene.record.node_fields:
+            fields["velocity"] = simulation.node_velocity
+        self.trajectory.append(
+            simulation.step_count,
+            simulation.time,
+            simulation.strain,
+            simulation.node_pos,
+            simulation.lattice,
+            fields,
+            {k: v for k, v in self.last_row.items() if k not in ("step", "time", "strain")},
+        )
+
+    def _profile(self, stage: Stage) -> None:
+        """A few steps pass by pass, where that many are left before the next event."""
+        if min(self._steps_to_events(stage)) > 2 * PROFILE_STEPS:
+            before = self.simulation.step_count
+            for name, seconds in self.simulation.pass_times(PROFILE_STEPS).items():
+                self.passes.setdefault(name, []).append(seconds)
+            self.summary.profiled_steps += self.simulation.step_count - before
+
+    def _show_progress(self) -> None:
+        if self.progress is not None:
+            self.progress.update(self)
+
+    # -- checkpoints ------------------------------------------------------------------------------
+
+    def _attrs(self) -> dict[str, Any]:
+        return {
+            "hash": self.scene.hash,
+            "device": self.simulation.device,
+            "precision": self.scene.numerics.precision,
+            "seed": self.scene.seed,
+            "dt": self.simulation.dt,
+            **versions(),
+        }
+
+    def _position(self) -> dict[str, Any]:
+        """Where the run stands among its stages and events."""
+        return {
+            "stage_index": self.stage_index,
+            "stage_strain": self.stage_start[0],
+            "stage_time": self.stage_start[1],
+            "row_index": self.row_index,
+            "frame_index": self.frame_index,
+            "wall_seconds": self.summary.wall_seconds,
+        }
+
+    def _keep_good(self) -> None:
+        """Remember the present state in case a later step diverges."""
+        arrays = self.simulation.snapshot()
+        if all(np.isfinite(a).all() for a in arrays.values()):
+            self.good, self.good_attrs = arrays, self._position()
+
+    def _write_checkpoint(self, arrays: dict[str, np.ndarray], position: dict[str, Any]) -> Path:
+        start, group = self.simulation.fiber_node_start, self.simulation.model.host["fiber_group"]
+        attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
+        length = self.simulation.model.units.length
+        layout: dict[str, np.ndarray] = {
+            "fiber_node_start": start,
+            "fiber_group": group,
+            "length": np.asarray(length),
+        }
+        self.summary.checkpoint_time = time.perf_counter()
+        step = int(arrays["step"][0])
+        return write_checkpoint(self.folder.path, step, arrays | layout, attrs)
+
+    def _checkpoint_if_due(self) -> None:
+        due = self.scene.record.checkpoint_every
+        if time.perf_counter() - self.summary.checkpoint_time > due:
+            self._write_checkpoint(self.simulation.snapshot(), self._position())
+
+    def _diverged(self, torn: Diverged) -> int:
+        """Last good state as the checkpoint, the bad one beside it for a look."""
+        if self.good:
+            path = self._write_checkpoint(self.good, self.good_attrs)
+            torn.report["message"] += f"; last good state: {path}"
+        bad = self.simulation.snapshot()
+        write_bad = self.folder.path / "diverged.npz"
+        np.savez(write_bad, fiber_node_start=self.simulation.fiber_node_start, **bad)  # type: ignore[arg-type]
+        self.folder.log(torn.report["message"])
+        self.summary.failure = torn.report
+        return 3
+
+    def _close(self) -> None:
+        self.scalars.close()
+        if self.trajectory is not None:
+            self.trajectory.close()
+        self.simulation.close()
+        if self.progress is not None:
+            self.progress.close()
+
+
+def _placement(arrays: dict[str, np.ndarray]) -> Any:
+    """The layout of a checkpoint as a placement; positions are overwritten by the restore."""
+    from warpfiber.placement import Placement
+
+    return Placement(
+        node_pos=arrays["node_pos"].astype(float) * float(arrays["length"]),
+        fiber_node_start=arrays["fiber_node_start"],
+        fiber_group=arrays["fiber_group"],
+        report={},
+    )

@@ -1,0 +1,1 @@
+"""Device physics: `@wp.func` formulas, one law per file, made once per precision."""

@@ -1,0 +1,1 @@
+"""One file = one published way to advance a state: which passes, in which order."""

@@ -1,0 +1,333 @@
+"""Explicit bead chain of Sasayama & Inagaki 2018, Eq. (16); N_R = 0 is their SBCM.
+
+A step: clock (time, flow, lattice), pair sweep (repulsion, lubrication), node sweep (gather, drag,
+stretching, bending, hydrodynamic torque, closure, semi-implicit Euler).
+Limits: first order in dt; dt below `stability.step_limits`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.laws.lubrication import OUTER
+from warpfiber.laws.repulsion import RANGE
+from warpfiber.model import BAD_FIBER, EXPIRED, TORN, Model, State
+from warpfiber.passes.clock import make_clock
+from warpfiber.passes.executor import Executor, Launch
+from warpfiber.passes.measure import TERMS, make_measure_terms
+from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
+from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.scene import Scene
+
+# Below this many segments the hand-off between workers costs more than it saves.
+WORKER_BREAK_EVEN = 5000
+LIST_SKIN = 0.3  # diameters
+
+
+def contact_reach(scene: Scene) -> float:
+    """Largest distance of center lines that interact, in sums of radii; 0 without pairs."""
+    if scene.contact.lubrication != "none":
+        return OUTER
+    return RANGE if scene.contact.law != "none" else 0.0
+
+
+class BeadChain:
+    """Advances a State by the explicit bead chain."""
+
+    def __init__(
+        self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
+    ) -> None:
+        self.scene, self.model, self.state = scene, model, state
+        self.dt = dt / model.units.time
+        self.workers = self._choose_workers(workers)
+        units, contact, domain = model.units, scene.contact, model.domain
+        self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
+        self.flow_origin = np.zeros(3)
+        if scene.flow is not None and scene.flow.origin is not None:
+            self.flow_origin = np.asarray(scene.flow.origin) / units.length
+        self.strength = (contact.strength or 0.0) / units.force
+        self.decay = contact.decay or 0.0
+        self.has_pairs = contact_reach(scene) > 0.0 and model.segment_count > 1
+        self.pair_features = PairFeatures(
+            repulsion=contact.law != "none",
+            lubrication=contact.lubrication,
+            periodic=any(domain.periodic),
+            sheared=domain.sheared,
+        )
+        self.list: NeighborList | None = None
+        self.list_seconds = 0.0
+        if self.has_pairs:
+            largest = max(row["radius"] for row in model.group_rows)
+            longest = max(row["rest"] for row in model.group_rows) * 1.05
+            skin = LIST_SKIN * 2.0 * largest
+            if scene.numerics.skin is not None:
+                skin = scene.numerics.skin / units.length
+            self.list = NeighborList(
+                model,
+                state,
+                reach=contact_reach(scene) * 2.0 * largest,
+                skin=skin,
+                longest=longest,
+            )
+        self.set_gradient()
+        self._allocate_pair_results()
+        self.executor: Executor | None = None
+
+    def _choose_workers(self, workers: int | None) -> int:
+        if not self.model.device.startswith("cpu"):
+            return 1
+        if workers is not None:
+            return workers
+        if self.model.segment_count < WORKER_BREAK_EVEN:
+            return 1
+        return min(2, len(os.sched_getaffinity(0)))
+
+    def set_gradient(self) -> None:
+        """The flow's gradient at the present strain, before the first step sets it."""
+        p, scene = self.model.precision, self.scene
+        full = np.zeros((3, 3))
+        if scene.flow is not None and scene.flow.velocity_gradient is not None:
+            full = np.asarray(scene.flow.velocity_gradient) * self.model.units.time
+        self.full_gradient = full
+        schedule = scene.flow.schedule if scene.flow and scene.flow.schedule else ((0.0, 1.0),)
+        self.schedule = np.asarray(schedule, dtype=np.float64)
+        strain = float(self.state.strain.numpy()[0])
+        factor = np.interp(strain, self.schedule[:, 0], self.schedule[:, 1])
+        self.state.gradient.assign((full * factor)[None].astype(p.numpy))
+
+    def _allocate_pair_results(self) -> None:
+        p, device = self.model.precision, self.model.device
+        size = self.list.pair_capacity if self.list else 0
+        arms = size if self.pair_features.storage == "arms" else 0
+        self.pair_force = wp.zeros(size, dtype=p.vec3, device=device)
+        self.pair_closest = wp.zeros(size - arms, dtype=p.vec2, device=device)
+        self.pair_arm_i = wp.zeros(arms, dtype=p.vec3, device=device)
+        self.pair_arm_j = wp.zeros(arms, dtype=p.vec3, device=device)
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    def _launches(self) -> list[Launch]:
+        model, state, p = self.model, self.state, self.model.precision
+        name, domain = p.name, model.domain
+        scheduled = len(self.schedule) > 1
+        clock = make_clock(name, domain.sheared, scheduled)
+        launches = [
+            Launch(
+                "clock",
+                clock,
+                1,
+                [
+                    wp.float64(self.dt),
+                    wp.float64(self.flow_rate),
+                    wp.mat33d(*self.full_gradient.ravel()),
+                    wp.array(self.schedule, dtype=wp.vec2d, device=model.device),
+                    state.status,
+                    state.step,
+                    state.time,
+                    state.strain,
+                    state.gradient,
+                    state.lattice,
+                    state.lattice_now,
+                    state.deformation,
+                ],
+            )
+        ]
+        pairs = self.list
+        if pairs is not None:
+            launches.append(
+                Launch(
+                    "pairs",
+                    make_pair_sweep(name, self.pair_features),
+                    model.segment_count,
+                    [
+                        p.real(self._lubrication_dt()),
+                        p.real(self.strength),
+                        p.real(self.decay),
+                        model.groups,
+                        model.fiber_node_start,
+                        model.fiber_group,
+                        model.segment_node,
+                        model.segment_fiber,
+                        state.gradient,
+                        state.lattice_now,
+                        pairs.out_start,
+                        pairs.pair_j,
+                        pairs.pair_image,
+                        state.node_pos,
+                        state.node_velocity,
+                        state.status,
+                        self.pair_force,
+                        self.pair_closest,
+                        self.pair_arm_i,
+                        self.pair_arm_j,
+                    ],
+                    split=True,
+                )
+            )
+        launches.append(self._node_launch())
+        return launches
+
+    def _lubrication_dt(self) -> float:
+        """dt of the limited resistance; 0 leaves the published one.
+
+        Twice the step: a bead may have four partners at the smallest gap and still not be turned
+        round.
+        """
+        return 2.0 * self.dt if self.scene.numerics.lubrication_step == "limited" else 0.0
+
+    def _node_launch(self) -> Launch:
+        model, state, p, pairs = self.model, self.state, self.model.precision, self.list
+        closure = self.scene.numerics.closure
+        if all(abs(row["spacing"] - 1.0) < 1e-12 for row in model.group_rows):
+            closure = "none"  # every factor is 1 and A is the identity
+        features = NodeFeatures(
+            closure=closure,
+            pairs=self.pair_features.storage if pairs is not None else "none",
+            walls=model.domain.wall,
+            gravity=self.scene.gravity is not None,
+        )
+        low = np.asarray(model.domain.low)
+        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
+        return Launch(
+            "nodes",
+            make_node_sweep(p.name, features),
+            model.fiber_count,
+            [
+                p.real(self.dt),
+                p.vec3(*self.flow_origin),
+                p.vec3(*low),
+                p.vec3(*(low + np.asarray(model.domain.size))),
+                p.real(self.strength),
+                p.real(self.decay),
+                p.real(pairs.reach + pairs.skin if pairs else 0.0),
+                p.real(pairs.skin if pairs else 0.0),
+                model.groups,
+                model.pivots,
+                model.fiber_node_start,
+                model.fiber_group,
+                state.gradient,
+                state.deformation,
+                pairs.out_start if pairs else none_i,
+                pairs.in_start if pairs else none_i,
+                pairs.in_pair if pairs else none_i,
+                self.pair_force,
+                self.pair_closest,
+                self.pair_arm_i,
+                self.pair_arm_j,
+                state.list_pos,
+                state.node_pos,
+                state.node_velocity,
+                state.node_force,
+                state.status,
+            ],
+            split=True,
+        )
+
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """Seconds per step of every launch and of the list, over `steps` steps of the run."""
+        self.prepare()
+        assert self.executor is not None
+        times = self.executor.time_launches(steps, self._halted)
+        if self._halted() and self.state.status.numpy()[EXPIRED]:
+            self.refresh_list()
+        return times
+
+    def refresh_list(self, *, wrap: bool = True) -> None:
+        """Build the neighbor list now (also clears its expiry)."""
+        if self.list is None:
+            return
+        begin = time.perf_counter()
+        replaced = self.list.build(wrap=wrap)
+        self.list_seconds += time.perf_counter() - begin
+        if replaced:
+            self._allocate_pair_results()
+            self._stop_executor()
+
+    def prepare(self) -> None:
+        """Compile, build the first list and capture, so that the next `advance` only steps."""
+        if self.list is not None and self.list.build_count == 0:
+            self.refresh_list()
+        if self.executor is None:
+            self.executor = Executor(self._launches(), self.model.device, self.workers)
+
+    def advance(self, steps: int) -> bool:
+        """Run up to `steps` steps, rebuilding the list where it expires; False if a fiber tore."""
+        target = self.step_count + steps
+        while self.step_count < target:
+            self.prepare()
+            assert self.executor is not None
+            self.executor.run(target - self.step_count, self._halted)
+            if self.state.status.numpy()[TORN]:
+                return False
+            if self.state.status.numpy()[EXPIRED]:
+                self.refresh_list()
+        return True
+
+    def _halted(self) -> bool:
+        status = self.state.status.numpy()
+        return bool(status[EXPIRED] or status[TORN])
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken."""
+        return int(self.state.step.numpy()[0])
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        self._stop_executor()
+
+    def _stop_executor(self) -> None:
+        if self.executor is not None:
+            self.executor.close()
+            self.executor = None
+
+    # -- what went wrong --------------------------------------------------------------------------
+
+    def torn_fiber(self) -> dict[str, Any]:
+        """Fiber, its first bad node, and its largest force term (N) after a failed `advance`."""
+        model, state = self.model, self.state
+        fiber = int(state.status.numpy()[BAD_FIBER])
+        terms = wp.zeros(len(TERMS), dtype=wp.float64, device=model.device)
+        features = "pairs" if self.list is not None else "none"
+        pairs = self.list
+        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
+        wp.launch(
+            make_measure_terms(model.precision.name, features),
+            dim=1,
+            inputs=[
+                fiber,
+                model.precision.vec3(*self.flow_origin),
+                model.groups,
+                model.fiber_node_start,
+                model.fiber_group,
+                state.gradient,
+                state.node_pos,
+                state.node_velocity,
+                pairs.out_start if pairs else none_i,
+                pairs.in_start if pairs else none_i,
+                pairs.in_pair if pairs else none_i,
+                self.pair_force,
+                terms,
+            ],
+            device=model.device,
+        )
+        first, end = model.host["fiber_node_start"][fiber : fiber + 2]
+        nodes = state.node_pos.numpy()[first:end].astype(float)
+        rest = model.group_rows[model.host["fiber_group"][fiber]]["rest"]
+        length = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / rest
+        worst = int(np.argmax(np.where(np.isfinite(length), length, math.inf)))
+        sizes = terms.numpy() * model.units.force
+        return {
+            "fiber": fiber,
+            "node": worst,
+            "terms": dict(zip(TERMS, map(float, sizes), strict=True)),
+            "largest_term": TERMS[int(np.argmax(np.where(np.isfinite(sizes), sizes, math.inf)))],
+            "stretch": float(length[worst]),
+        }

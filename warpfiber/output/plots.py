@@ -1,0 +1,366 @@
+"""Figures of a run, drawn from its folder alone; each PNG lies beside a CSV with what it shows.
+
+Curves against strain (time, where nothing is strained): orientation, interactions, overlap, energy,
+axial strain, angle, and the tip of a few fibers; `cell.png` is a picture of the cell at the end.
+Points of `reference/*.csv` beside the scene are drawn over them: a header row with `strain` (or
+`time`) and columns named as in `scalars.csv` (`tip` for the tip); lines with # are comments.
+
+Symbols: a_ij orientation tensor; x, y, z = 1, 2, 3. Colors: x red, y green, z blue throughout.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpfiber.output.cell_picture import AXIS_COLORS, draw_cell
+from warpfiber.output.folder import ResultFolder
+from warpfiber.output.record_error import record_errors
+from warpfiber.output.scalars import read_scalars
+from warpfiber.output.trajectory import TrajectoryReader
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Table = dict[str, NDArray[Any]]
+TIP_FIBERS = 10  # more curves than this say nothing
+_DPI = 160
+_INK, _GRAY = "#22262b", "#6b7280"
+_BLUE, _ORANGE, _GREEN, _PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One figure: its file name, its words, and for each column a label and a color."""
+
+    name: str
+    title: str
+    ylabel: str
+    columns: Mapping[str, tuple[str, str]]
+    ylim: tuple[float, float] | None = None
+    logarithmic: bool = False
+
+
+_FIGURES = (
+    Curves(
+        "orientation",
+        "Orientation tensor",
+        "orientation tensor component",
+        {
+            "a11": ("$a_{11}$  flow", AXIS_COLORS[0]),
+            "a22": ("$a_{22}$  vorticity", AXIS_COLORS[1]),
+            "a33": ("$a_{33}$  gradient", AXIS_COLORS[2]),
+        },
+        ylim=(0.0, 1.0),
+    ),
+    Curves(
+        "interactions",
+        "Interactions and contacts",
+        "number per fiber",
+        {
+            "interactions_per_fiber": ("interactions", _BLUE),
+            "contacts_per_fiber": ("contacts", _ORANGE),
+            "coordination_number": ("touching fibers", _GREEN),
+        },
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
+        "overlap",
+        "Overlap of fibers in contact",
+        "overlap / fiber radius",
+        {"overlap_max": ("largest", _ORANGE), "overlap_mean": ("mean", _BLUE)},
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
+        "energy",
+        "Energies",
+        "energy (J)",
+        {
+            "energy_kinetic": ("kinetic", _BLUE),
+            "energy_stretching": ("stretching", _GREEN),
+            "energy_bending": ("bending", _ORANGE),
+            "energy_repulsion": ("repulsion", _PURPLE),
+        },
+        logarithmic=True,
+    ),
+    Curves(
+        "axial_strain",
+        "Axial strain of segments",
+        "largest |axial strain|",
+        {"axial_strain_max": ("largest", _ORANGE)},
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
+        "angle", "Rotation in the flow-gradient plane", "mean angle (rad)", {"angle": ("", _BLUE)}
+    ),
+)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What the figures of one folder need."""
+
+    label: str
+    table: Table
+    folder: ResultFolder
+    scene: Mapping[str, Any]
+
+
+def plot_run(folders: Any, out: str | Path | None = None) -> list[Path]:
+    """Draw all figures of one folder, or of several in the same axes; returns the PNG files.
+
+    `folders`: path or ResultFolder, or a list of them. `out`: folder for the pictures, by default
+    `figures/` of the first run. A figure without data is left out. Raises SceneError if a folder
+    is missing, RecordError if a file is damaged or cannot be written.
+    """
+    several = folders if isinstance(folders, (list, tuple)) else [folders]
+    runs = [_read_run(folder) for folder in several]
+    target = runs[0].folder.path / "figures" if out is None else Path(out)
+    with record_errors(target, "make the folder"):
+        target.mkdir(parents=True, exist_ok=True)
+    references = _references(runs[0])
+    written = []
+    for curves in (*_FIGURES, _tip_curves(runs)):
+        path = target / f"{curves.name}.png"
+        if _draw_curves(curves, runs, references, path):
+            written.append(path)
+    if runs[0].folder.trajectory_path.exists():
+        with TrajectoryReader(runs[0].folder.trajectory_path) as reader:
+            if reader.frame_count:
+                draw_cell(reader, target / "cell.png")
+                written.append(target / "cell.png")
+    return written
+
+
+def _read_run(given: Any) -> _Run:
+    folder = ResultFolder.open(getattr(given, "path", given))
+    table: Table = {}
+    if folder.scalars_path.exists():
+        table |= read_scalars(folder.scalars_path)
+    scene = folder.read_scene()
+    label = folder.path.resolve().name
+    return _Run(label, _with_tips(table, folder), folder, scene)
+
+
+def _with_tips(table: Table, folder: ResultFolder) -> Table:
+    """The table and, from the record of at most TIP_FIBERS fibers, columns `tip` or `tip_<fiber>`.
+
+    z of the last node from the center of its fiber, over the centerline length L of the first
+    frame; these columns belong to `tip_strain`, the strain of the frames.
+    """
+    path = folder.trajectory_path
+    if not path.exists():
+        return table
+    with TrajectoryReader(path) as reader:
+        fibers, start = reader.fiber_count, reader.fiber_node_start
+        if not 0 < fibers <= TIP_FIBERS or not reader.frame_count:
+            return table
+        frames = np.array([reader.node_pos(k) for k in range(reader.frame_count)], np.float64)
+        tips: Table = {"tip_strain": reader.strain, "tip_time": reader.time}
+    for k in range(fibers):
+        nodes = frames[:, start[k] : start[k + 1]]
+        length = np.linalg.norm(np.diff(nodes[0], axis=0), axis=1).sum()
+        name = "tip" if fibers == 1 else f"tip_{k}"
+        tips[name] = (nodes[:, -1, 2] - nodes[:, :, 2].mean(axis=1)) / (length or 1.0)
+    return table | tips
+
+
+def _tip_curves(runs: Iterable[_Run]) -> Curves:
+    names = {name for run in runs for name in run.table if name.startswith("tip")}
+    names -= {"tip_strain", "tip_time"}
+    shades = [_BLUE, _ORANGE, _GREEN, _PURPLE, "#c0487a", "#5b8a72", "#b59a2c", "#4a5ba8"]
+    columns = {
+        name: (name.replace("tip_", "fiber ").replace("tip", ""), shades[k % len(shades)])
+        for k, name in enumerate(sorted(names))
+    }
+    return Curves("tip", "Height of the fiber tip", "$z_{\\mathrm{tip}}\\,/\\,L$", columns)
+
+
+def _abscissa(table: Mapping[str, NDArray[Any]], column: str) -> tuple[str, NDArray[Any]]:
+    """What a column is drawn against: strain, or time where the strain stays zero or is absent."""
+    prefix = "tip_" if column.startswith("tip") and "tip_strain" in table else ""
+    for name in ("strain", "time", "step"):
+        values = table.get(prefix + name)
+        if values is not None and (name == "step" or len(values) < 2 or np.ptp(values) > 0):
+            return name, values
+    return "row", np.arange(len(table[column]))
+
+
+def _references(run: _Run) -> dict[str, Table]:
+    """Tables of `reference/*.csv` beside the scene file, by file name; empty if it is not found."""
+    named = run.scene.get("path") or run.folder.read_summary().get("scene_path")
+    found: dict[str, Table] = {}
+    if not named:
+        return found
+    for path in sorted((Path(str(named)).parent / "reference").glob("*.csv")):
+        with record_errors(path, "read"):
+            lines = path.read_text(encoding="utf-8").splitlines()
+        rows = list(csv.reader(line for line in lines if line.strip() and line[0] != "#"))
+        if not rows:
+            continue
+        names = [name.strip() for name in rows[0]]
+        try:
+            body = np.array([[float(entry or "nan") for entry in row] for row in rows[1:]])
+        except ValueError:
+            continue  # a table of words is no curve
+        if body.ndim == 2 and body.shape[1] == len(names):
+            found[path.stem] = {name: body[:, k] for k, name in enumerate(names)}
+    return found
+
+
+def _draw_curves(
+    curves: Curves, runs: Sequence[_Run], references: Mapping[str, Table], path: Path
+) -> bool:
+    """Draw one figure and its CSV; false if no run has a column of it."""
+    drawn = [run for run in runs if any(_finite(run.table, name) for name in curves.columns)]
+    if not drawn:
+        return False
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 3.9), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    rows: list[list[Any]] = []
+    ends: list[tuple[float, str, str]] = []
+    against = "strain"
+    for name, (label, color) in curves.columns.items():
+        lasts = []
+        for run in drawn:
+            if not _finite(run.table, name):
+                continue
+            against, x = _abscissa(run.table, name)
+            y = run.table[name].astype(float)
+            shown = np.where(y > 0, y, np.nan) if curves.logarithmic else y
+            if not np.isfinite(shown).any():
+                continue
+            dash = _DASHES[drawn.index(run) % len(_DASHES)]
+            axes.plot(x, shown, color=color, linestyle=dash, linewidth=1.6, zorder=3)
+            known = shown[np.isfinite(shown)]
+            lasts.append(np.median(known[-max(1, len(known) // 30) :]))
+            rows += [[run.label, name, a, b] for a, b in zip(x, y, strict=True)]
+        if lasts and label:
+            # Flow, vorticity and gradient are directions of simple shear only.
+            words = label if _sheared(drawn[0]) else label.split("  ")[0]
+            ends.append((float(np.mean(lasts)), words, color))
+        rows += _draw_reference(axes, references, name, against, color)
+    if not rows:
+        return False
+    _dress(axes, curves, drawn, against)
+    _label_ends(axes, ends)
+    _draw_legend(axes, drawn, references)
+    with record_errors(path, "write"):
+        figure.savefig(path)
+        with path.with_suffix(".csv").open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["run", "column", against, "value"])
+            writer.writerows(rows)
+    return True
+
+
+def _sheared(run: _Run) -> bool:
+    return (run.scene.get("flow") or {}).get("kind") == "simple_shear"
+
+
+def _finite(table: Mapping[str, NDArray[Any]], name: str) -> bool:
+    return name in table and bool(np.isfinite(table[name]).any())
+
+
+def _draw_reference(
+    axes: Axes, references: Mapping[str, Table], name: str, against: str, color: str
+) -> list[list[Any]]:
+    rows: list[list[Any]] = []
+    for k, (stem, table) in enumerate(references.items()):
+        if name in table and against in table:
+            marker = "osD^v"[k % 5]
+            style: dict[str, Any] = {
+                "marker": marker,
+                "markersize": 4.5,
+                "markerfacecolor": "white",
+                "clip_on": False,
+            }
+            axes.plot(table[against], table[name], color=color, linestyle="", zorder=2.5, **style)
+            points = zip(table[against], table[name], strict=True)
+            rows += [[f"reference {stem}", name, a, b] for a, b in points]
+    return rows
+
+
+def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> None:
+    """Title, axes, limits and the light grid."""
+    scene = runs[0].scene
+    strain = "shear strain" if _sheared(runs[0]) else "strain"
+    words = {"strain": strain, "time": "time (s)"}
+    axes.set_xlabel(words.get(against, against), color=_INK)
+    axes.set_ylabel(curves.ylabel, color=_INK)
+    axes.set_title(curves.title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=10)
+    if len(runs) == 1 and scene.get("title"):
+        axes.set_title(str(scene["title"])[:60], loc="right", fontsize=9, color=_GRAY, pad=10)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color("#9aa1ab")
+    axes.tick_params(which="both", color="#9aa1ab", labelcolor=_GRAY, labelsize=9)
+    axes.grid(True, color="#e6e8eb", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.margins(x=0)
+    if curves.logarithmic:
+        axes.set_yscale("log")
+    elif curves.ylim:
+        low, high = curves.ylim
+        axes.set_ylim(low, high if np.isfinite(high) else max(1.08 * axes.get_ylim()[1], 1e-12))
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
+    """Write each label where its curve ends, pushed apart where they would overlap."""
+    if not ends:
+        return
+    transform, spacing = axes.transData + axes.transAxes.inverted(), 0.062
+    x = axes.get_xlim()[1]
+    order = sorted(ends)
+    heights = [float(transform.transform((x, value))[1]) for value, _, _ in order]
+    placed = list(heights)
+    for _ in range(50):
+        for k in range(len(placed) - 1):
+            short = spacing - (placed[k + 1] - placed[k])
+            if short > 1e-6:
+                placed[k] -= short / 2
+                placed[k + 1] += short / 2
+    lift = max(0.0, 0.02 - placed[0])
+    for (_, label, color), height in zip(order, placed, strict=True):
+        axes.annotate(
+            label,
+            (1.0, height + lift),
+            xytext=(6, 0),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            va="center",
+            color=color,
+            fontsize=10,
+        )
+
+
+def _draw_legend(axes: Axes, runs: Sequence[_Run], references: Mapping[str, Table]) -> None:
+    """Name the runs, if several, and the references that are drawn."""
+    from matplotlib.lines import Line2D
+
+    entries: list[Any] = []
+    if len(runs) > 1:
+        for k, run in enumerate(runs):
+            dash = _DASHES[k % len(_DASHES)]
+            entries.append(Line2D([], [], color=_GRAY, linestyle=dash, label=run.label))
+    shown = {line.get_marker() for line in axes.get_lines()}
+    for k, stem in enumerate(references):
+        marker = "osD^v"[k % 5]
+        if marker in shown:
+            style: dict[str, Any] = {"marker": marker, "linestyle": "", "markerfacecolor": "white"}
+            entries.append(Line2D([], [], color=_GRAY, label=stem.replace("_", " "), **style))
+    if entries:
+        legend = axes.legend(handles=entries, framealpha=0.88, fontsize=9, labelcolor=_GRAY)
+        legend.get_frame().set_linewidth(0)

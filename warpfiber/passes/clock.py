@@ -1,0 +1,72 @@
+"""Begin of a step: time, strain, the flow's gradient, the lattice and the list's deformation.
+
+Source: d(lattice)/dt = L lattice for a box whose lattice moves with the flow; exp(L dt) by its
+    series to fourth order (exact for simple shear, where L L = 0).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpfiber.model import EXPIRED, HALT, TORN, precision
+
+
+@cache
+def make_clock(name: str, sheared: bool, scheduled: bool):
+    """Kernel `clock_step` (one thread)."""
+    p = precision(name)
+    vec3, mat33 = p.vec3, p.mat33
+    del vec3
+
+    @wp.func
+    def rate_factor(strain: wp.float64, schedule: wp.array(dtype=wp.vec2d)) -> wp.float64:
+        """Linear between the rows (strain, factor), constant beyond them."""
+        n = schedule.shape[0]
+        if strain <= schedule[0][0]:
+            return schedule[0][1]
+        for k in range(1, n):
+            if strain < schedule[k][0]:
+                w = (strain - schedule[k - 1][0]) / (schedule[k][0] - schedule[k - 1][0])
+                return (wp.float64(1.0) - w) * schedule[k - 1][1] + w * schedule[k][1]
+        return schedule[n - 1][1]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def clock_step(
+        dt: wp.float64,
+        rate: wp.float64,
+        full_gradient: wp.mat33d,
+        schedule: wp.array(dtype=wp.vec2d),
+        status: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.int64),
+        time: wp.array(dtype=wp.float64),
+        strain: wp.array(dtype=wp.float64),
+        gradient_out: wp.array(dtype=mat33),
+        lattice: wp.array(dtype=wp.mat33d),
+        lattice_now_out: wp.array(dtype=mat33),
+        deformation: wp.array(dtype=wp.mat33d),
+    ):
+        if status[wp.static(EXPIRED)] != 0 or status[wp.static(TORN)] != 0:
+            status[wp.static(HALT)] = 1
+            return
+        status[wp.static(HALT)] = 0
+        factor = wp.float64(1.0)
+        if wp.static(scheduled):
+            factor = rate_factor(strain[0], schedule)
+        gradient = factor * full_gradient
+        gradient_out[0] = mat33(gradient)
+        lattice_now_out[0] = mat33(lattice[0])
+        x = dt * gradient
+        one = wp.identity(n=3, dtype=wp.float64)
+        push = one + x * (
+            one
+            + (x * (one + (x * (one + x * wp.float64(0.25))) * wp.float64(1.0 / 3.0)))
+            * wp.float64(0.5)
+        )
+        if wp.static(sheared):
+            lattice[0] = push * lattice[0]
+        deformation[0] = push * deformation[0]
+        time[0] = time[0] + dt
+        strain[0] = strain[0] + dt * rate * factor
+        step[0] = step[0] + wp.int64(1)
+
+    return clock_step

@@ -1,0 +1,197 @@
+"""How launches run: captured once, replayed many times, by one worker or several.
+
+A step is a list of phases, a phase one launch over an index range. With one worker a whole step
+(and a batch of steps) is one graph, on CPU and CUDA alike. With more workers (CPU only) every
+worker owns one graph per phase over its part of the range, and the phases are handed over by locks:
+Warp itself runs kernels serially on the CPU. No kernel writes where another index reads, so the
+result is the same to the last bit for any number of workers.
+
+Limits: nothing may be launched from another thread during a capture (Warp's recording is global).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+BATCH = 16  # steps per graph where looking after every step would cost more than it saves
+BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
+
+
+def load_kernel(kernel: Any, device: str) -> None:
+    """Compile or load a kernel for the block size that `wp.launch` will use on this device."""
+    target = wp.get_device(device)
+    kernel.module.load(target, block_dim=1 if target.is_cpu else 256)
+
+
+@dataclass
+class Launch:
+    """One kernel over `dim` items; `split` kernels take the offset of their first item first."""
+
+    name: str
+    kernel: Any
+    dim: int
+    inputs: list[Any]
+    split: bool = False
+
+    def part(self, worker: int, workers: int) -> tuple[int, int]:
+        """First item and number of items of one worker."""
+        if not self.split:
+            return 0, self.dim if worker == 0 else 0
+        begin = self.dim * worker // workers
+        return begin, self.dim * (worker + 1) // workers - begin
+
+    def run(self, device: str, worker: int = 0, workers: int = 1) -> None:
+        """Launch this worker's part."""
+        begin, count = self.part(worker, workers)
+        if count == 0:
+            return
+        inputs = [begin, *self.inputs] if self.split else self.inputs
+        wp.launch(self.kernel, dim=count, inputs=inputs, device=device)
+
+    def load(self, device: str) -> None:
+        """Compile or load the kernel's module, which must not happen inside a capture."""
+        load_kernel(self.kernel, device)
+
+
+class Executor:
+    """Replays the steps made of `launches`."""
+
+    def __init__(self, launches: list[Launch], device: str, workers: int = 1) -> None:
+        self.launches = [launch for launch in launches if launch.dim > 0]
+        self.device = device
+        self.workers = max(1, workers)
+        for launch in self.launches:
+            launch.load(device)
+        items = sum(launch.dim for launch in self.launches)
+        self.batches = items < BATCH_BELOW or not device.startswith("cpu")
+        self._pool: _Workers | None = None
+        if self.workers > 1:
+            phases = [self._capture_phase(launch) for launch in self.launches]
+            self._pool = _Workers(phases, self.workers)
+        else:
+            self._single = self._capture_steps(1)
+            self._batch: Any = None
+
+    def _capture_steps(self, steps: int) -> Any:
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for _ in range(steps):
+                for launch in self.launches:
+                    launch.run(self.device)
+        return capture.graph
+
+    def _capture_phase(self, launch: Launch) -> list[Any]:
+        graphs: list[Any] = []
+        for worker in range(self.workers):
+            if launch.part(worker, self.workers)[1] == 0:
+                graphs.append(None)
+                continue
+            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+                launch.run(self.device, worker, self.workers)
+            graphs.append(capture.graph)
+        return graphs
+
+    def run(self, steps: int, halted: Callable[[], bool]) -> None:
+        """Replay up to `steps` steps, looking at `halted` after every graph."""
+        if self._pool is not None:
+            self._pool.run(steps, halted)
+            return
+        batch = BATCH if self.batches else 1
+        while steps > 0 and not halted():
+            if steps < batch or batch == 1:
+                wp.capture_launch(self._single)
+                steps -= 1
+                continue
+            if self._batch is None:
+                self._batch = self._capture_steps(batch)
+            wp.capture_launch(self._batch)
+            steps -= batch
+
+    def time_launches(self, steps: int, halted: Callable[[], bool]) -> dict[str, float]:
+        """Seconds per step of every launch, over up to `steps` real steps by one worker.
+
+        The cost of replaying an empty graph is subtracted: it is not paid inside a whole step.
+        """
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            pass
+        graphs = [("", capture.graph)]
+        for launch in self.launches:
+            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+                launch.run(self.device)
+            graphs.append((launch.name, capture.graph))
+        best: dict[str, list[float]] = {name: [] for name, _ in graphs}
+        for _ in range(steps):
+            if halted():
+                break
+            for name, graph in graphs:
+                wp.synchronize_device(self.device)
+                begin = time.perf_counter()
+                wp.capture_launch(graph)
+                wp.synchronize_device(self.device)
+                best[name].append(time.perf_counter() - begin)
+        median = {name: sorted(t)[len(t) // 2] if t else 0.0 for name, t in best.items()}
+        idle = median.pop("")
+        return {name: max(0.0, value - idle) for name, value in median.items()}
+
+    def close(self) -> None:
+        """End the extra worker threads."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+
+
+class _Workers:
+    """Persistent threads that replay their own graph of a phase when told to; the caller is worker
+    0.
+    """
+
+    def __init__(self, phases: list[list[Any]], workers: int) -> None:
+        self.phases = phases
+        self.go = [threading.Lock() for _ in range(workers - 1)]
+        self.done = [threading.Lock() for _ in range(workers - 1)]
+        self.phase: list[Any] | None = None
+        self.threads = []
+        for lock in (*self.go, *self.done):
+            lock.acquire()
+        for worker in range(1, workers):
+            thread = threading.Thread(target=self._work, args=(worker,), daemon=True)
+            thread.start()
+            self.threads.append(thread)
+
+    def _work(self, worker: int) -> None:
+        go, done = self.go[worker - 1], self.done[worker - 1]
+        while True:
+            go.acquire()
+            if self.phase is None:
+                return
+            graph = self.phase[worker]
+            if graph is not None:
+                wp.capture_launch(graph)
+            done.release()
+
+    def run(self, steps: int, halted: Callable[[], bool]) -> None:
+        for _ in range(steps):
+            if halted():
+                return
+            for phase in self.phases:
+                if all(graph is None for graph in phase[1:]):
+                    wp.capture_launch(phase[0])
+                    continue
+                self.phase = phase
+                for lock in self.go:
+                    lock.release()
+                wp.capture_launch(phase[0])
+                for lock in self.done:
+                    lock.acquire()
+
+    def close(self) -> None:
+        self.phase = None
+        for lock in self.go:
+            lock.release()
+        for thread in self.threads:
+            thread.join()

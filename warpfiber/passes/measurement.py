@@ -1,0 +1,182 @@
+"""Host side of the measurements: launches the reductions a scene asks for, adds their sums.
+
+Definitions: orientation tensors A_ij = <p_i p_j> of segments (weighted by length) and of end-to-end
+vectors; an interaction is a pair of segments under repulsion or under lubrication (both: two),
+counted for both fibers; a contact is a pair with D <= 2a; coordination number = distinct touching
+fibers; overlap = max(0, 2a - D) in radii, mean over touching pairs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.model import Model, State
+from warpfiber.passes.measure import (
+    FIBER_MAXIMA,
+    FIBER_SUMS,
+    PAIR_SUMS,
+    TENSOR,
+    TENSOR4,
+    MeasureFeatures,
+    make_measure_fibers,
+    make_measure_pairs,
+)
+from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.pairs import TOUCHES, PairFeatures
+
+CHUNKS = 256
+PAIR_QUANTITIES = {"contacts", "interactions", "overlap"}
+
+
+class Measurement:
+    """Measures what `quantities` names; everything else is neither launched nor allocated."""
+
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        quantities: tuple[str, ...],
+        pair_features: PairFeatures,
+        strength: float,
+        decay: float,
+    ) -> None:
+        self.model, self.state = model, state
+        self.quantities = frozenset(quantities)
+        self.pair_features = pair_features
+        self.strength, self.decay = strength, decay
+        self.angle: np.ndarray | None = None
+        if "rotation" in self.quantities:
+            self.angle = self._axis_angle()
+
+    def row(self, pairs: NeighborList | None) -> dict[str, float]:
+        """All asked quantities now, in SI (overlaps in radii)."""
+        row: dict[str, float] = {}
+        wanted = self.quantities
+        if wanted & {"orientation", "orientation4", "axial_strain", "energy", "curvature"}:
+            row |= self._fiber_row()
+        if wanted & PAIR_QUANTITIES or ("energy" in wanted and pairs is not None):
+            row |= self._pair_row(pairs)
+        if self.angle is not None:
+            step = self._axis_angle() - self.angle
+            self.angle = self.angle + (step + np.pi) % (2.0 * np.pi) - np.pi
+            row["angle"] = float(self.angle.mean())
+        return row
+
+    def _axis_angle(self) -> np.ndarray:
+        """Angle of every end-to-end vector in the x-z plane, (F,) rad."""
+        start = self.model.host["fiber_node_start"]
+        nodes = self.state.node_pos.numpy()
+        axis = nodes[start[1:] - 1].astype(float) - nodes[start[:-1]]
+        return np.arctan2(axis[:, 2], axis[:, 0])
+
+    def _sums(self, kernel: Any, sums: int, maxima: int, count: int, inputs: list[Any]) -> Any:
+        """Launch a reduction over `count` items and add the partial sums of its chunks in order."""
+        device = self.model.device
+        chunks = min(CHUNKS, count)
+        total = wp.zeros((chunks, sums), dtype=wp.float64, device=device)
+        largest = wp.zeros((chunks, maxima), dtype=wp.float64, device=device)
+        wp.launch(
+            kernel, dim=chunks, inputs=[chunks, count, *inputs, total, largest], device=device
+        )
+        return total.numpy().sum(axis=0), largest.numpy().max(axis=0)
+
+    def _fiber_row(self) -> dict[str, float]:
+        model, state, wanted = self.model, self.state, self.quantities
+        features = MeasureFeatures(
+            orientation4="orientation4" in wanted,
+            energy="energy" in wanted,
+            curvature="curvature" in wanted,
+        )
+        columns = len(FIBER_SUMS) + (len(TENSOR4) if features.orientation4 else 0)
+        values, largest = self._sums(
+            make_measure_fibers(model.precision.name, features),
+            columns,
+            len(FIBER_MAXIMA),
+            model.fiber_count,
+            [
+                model.groups,
+                model.fiber_node_start,
+                model.fiber_group,
+                state.node_pos,
+                state.node_velocity,
+            ],
+        )
+        sums = dict(zip(FIBER_SUMS, values, strict=False))
+        row: dict[str, float] = {}
+        if "orientation" in wanted:
+            row |= {name: sums[name] / sums["length"] for name in TENSOR}
+            row |= {f"{n}_fiber": sums[f"{n}_fiber"] / model.fiber_count for n in TENSOR}
+        if features.orientation4:
+            for index, value in zip(TENSOR4, values[len(FIBER_SUMS) :], strict=True):
+                name = "a" + "".join(str(i + 1) for i in index)
+                row[name] = value / sums["length"]
+        if "axial_strain" in wanted:
+            row["axial_strain_max"] = largest[0]
+        if features.curvature:
+            row["curvature_mean"] = sums["curvature"] / sums["length"] / model.units.length
+            row["curvature_max"] = largest[1] / model.units.length
+        if features.energy:
+            for name in ("energy_kinetic", "energy_stretching", "energy_bending"):
+                row[name] = sums[name] * model.units.energy
+        return {name: float(value) for name, value in row.items()}
+
+    def _pair_row(self, pairs: NeighborList | None) -> dict[str, float]:
+        model, wanted = self.model, self.quantities
+        sums = dict.fromkeys(PAIR_SUMS, 0.0)
+        largest = 0.0
+        coordination = 0.0
+        if pairs is not None:
+            bits = wp.zeros(pairs.pair_capacity, dtype=wp.int32, device=model.device)
+            values, maxima = self._pair_sums(pairs, bits)
+            sums = dict(zip(PAIR_SUMS, map(float, values), strict=True))
+            largest = float(maxima[0])
+            if "contacts" in wanted:
+                coordination = self._coordination(pairs, bits.numpy())
+        fibers = model.fiber_count
+        row: dict[str, float] = {}
+        if "interactions" in wanted:
+            row["interactions_per_fiber"] = 2.0 * (sums["repelling"] + sums["lubricating"]) / fibers
+        if "contacts" in wanted:
+            row["contacts_per_fiber"] = 2.0 * sums["touching"] / fibers
+            row["coordination_number"] = coordination
+        if "overlap" in wanted:
+            row["overlap_max"] = largest
+            row["overlap_mean"] = sums["overlap"] / max(sums["touching"], 1.0)
+        if "energy" in wanted:
+            row["energy_repulsion"] = sums["energy_repulsion"] * model.units.energy
+        return row
+
+    def _pair_sums(self, pairs: NeighborList, bits: Any) -> Any:
+        model, state, p = self.model, self.state, self.model.precision
+        return self._sums(
+            make_measure_pairs(p.name, self.pair_features),
+            len(PAIR_SUMS),
+            1,
+            model.segment_count,
+            [
+                p.real(self.strength),
+                p.real(self.decay),
+                model.groups,
+                model.fiber_node_start,
+                model.fiber_group,
+                model.segment_node,
+                model.segment_fiber,
+                state.lattice,
+                pairs.out_start,
+                pairs.pair_j,
+                pairs.pair_image,
+                state.node_pos,
+                bits,
+            ],
+        )
+
+    def _coordination(self, pairs: NeighborList, bits: np.ndarray) -> float:
+        """Mean number of distinct fibers (images apart) that a fiber touches."""
+        i, j, image = pairs.host_pairs()
+        touching = (bits[: len(i)] & TOUCHES) != 0
+        fiber = self.model.host["segment_fiber"]
+        keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
+        return 2.0 * len(np.unique(keys, axis=0)) / self.model.fiber_count

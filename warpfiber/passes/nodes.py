@@ -1,0 +1,323 @@
+"""One sweep over fibers: gather pair forces, add drag and internal forces, close, integrate.
+
+One thread walks along one fiber. First walk: stretching, bending, hydrodynamic torque, walls and
+the gathered pair forces give the non-distributed force of every node. Second walk: the closure
+turns node forces into accelerations and the semi-implicit Euler step (velocity first, then position
+with the new velocity) moves the nodes. A fiber that is torn or not finite is left as it is and
+reported.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from warpfiber.laws.bending import make_bending
+from warpfiber.laws.closure import make_closure
+from warpfiber.laws.drag import make_drag
+from warpfiber.laws.flow import make_flow
+from warpfiber.laws.stretching import make_stretching
+from warpfiber.laws.torque import make_torque
+from warpfiber.laws.wall import make_wall
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN, precision
+from warpfiber.passes.precision import group_struct
+
+# A segment longer than this many rest lengths is no longer a physical state but a diverging step.
+TEAR_STRETCH = 2.0
+
+
+@dataclass(frozen=True)
+class NodeFeatures:
+    """What the node sweep of a scene contains; everything else is not compiled."""
+
+    closure: str  # none, paper, consistent
+    pairs: str = "none"  # none, closest, arms (see `pairs`)
+    walls: tuple[bool, bool, bool] = (False, False, False)
+    gravity: bool = False
+
+
+@cache
+def make_node_sweep(name: str, features: NodeFeatures):
+    """Kernel `node_sweep` in the given precision with the given features."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    flow_velocity, flow_spin = make_flow(name)
+    drag_force = make_drag(name)
+    torque_couple = make_torque(name)
+    stretching_force = make_stretching(name)
+    _, bending_forces = make_bending(name)
+    wall_push = make_wall(name)
+    (
+        split_force,
+        translation_factor,
+        distributed_translation_factor,
+        end_rotation_factor,
+        inner_rotation_factor,
+    ) = make_closure(name)
+
+    has_pairs = features.pairs != "none"
+    has_arms = features.pairs == "arms"
+    wall_x, wall_y, wall_z = features.walls
+    has_gravity = features.gravity
+    is_paper = features.closure == "paper"
+    is_consistent = features.closure == "consistent"
+    zero, one, two, half = real(0.0), real(1.0), real(2.0), real(0.5)
+    tear = real(TEAR_STRETCH)
+
+    @wp.func
+    def wall_force(
+        x: vec3, radius: real, low: vec3, high: vec3, strength: real, decay: real
+    ) -> vec3:
+        fx, fy, fz = zero, zero, zero
+        if wp.static(wall_x):
+            fx = wall_push(strength, decay, x[0] - low[0], radius)
+            fx -= wall_push(strength, decay, high[0] - x[0], radius)
+        if wp.static(wall_y):
+            fy = wall_push(strength, decay, x[1] - low[1], radius)
+            fy -= wall_push(strength, decay, high[1] - x[1], radius)
+        if wp.static(wall_z):
+            fz = wall_push(strength, decay, x[2] - low[2], radius)
+            fz -= wall_push(strength, decay, high[2] - x[2], radius)
+        return vec3(fx, fy, fz)
+
+    @wp.func
+    def gather_pairs(
+        segment: wp.int32,
+        out_start: wp.array(dtype=wp.int32),
+        in_start: wp.array(dtype=wp.int32),
+        in_pair: wp.array(dtype=wp.int32),
+        pair_force: wp.array(dtype=vec3),
+        pair_closest: wp.array(dtype=vec2),
+        pair_arm_i: wp.array(dtype=vec3),
+        pair_arm_j: wp.array(dtype=vec3),
+    ):
+        """Total pair force on a segment and its part on the second node."""
+        total = vec3(zero, zero, zero)
+        second = vec3(zero, zero, zero)
+        for k in range(out_start[segment], out_start[segment + 1]):
+            force = pair_force[k]
+            total += force
+            if wp.static(has_arms):
+                second += pair_arm_i[k]
+            else:
+                second += pair_closest[k][0] * force
+        for slot in range(in_start[segment], in_start[segment + 1]):
+            k = in_pair[slot]
+            force = pair_force[k]
+            total -= force
+            if wp.static(has_arms):
+                second -= pair_arm_j[k]
+            else:
+                second -= pair_closest[k][1] * force
+        return total, second
+
+    @wp.func
+    def skin_limit(affine: mat33, skin: real, list_reach: real) -> real:
+        """Largest |u| (motion beside the flow) with which no unlisted pair can be within reach.
+
+        2 max|u| + (1 - sigma_min(F)) h_list <= skin; 1 - sigma_min is at most the largest row sum
+        of |sym(F - I)|.
+        """
+        stretch = zero
+        for row in range(3):
+            norm = zero
+            for col in range(3):
+                identity = zero
+                if row == col:
+                    identity = one
+                norm += wp.abs(half * (affine[row, col] + affine[col, row]) - identity)
+            stretch = wp.max(stretch, norm)
+        return half * (skin - stretch * list_reach)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def node_sweep(
+        offset: wp.int32,
+        dt: real,
+        flow_origin: vec3,
+        wall_low: vec3,
+        wall_high: vec3,
+        strength: real,
+        decay: real,
+        list_reach: real,
+        skin: real,
+        groups: wp.array(dtype=Group),
+        pivots: wp.array(dtype=real),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=mat33),
+        deformation: wp.array(dtype=wp.mat33d),
+        out_start: wp.array(dtype=wp.int32),
+        in_start: wp.array(dtype=wp.int32),
+        in_pair: wp.array(dtype=wp.int32),
+        pair_force: wp.array(dtype=vec3),
+        pair_closest: wp.array(dtype=vec2),
+        pair_arm_i: wp.array(dtype=vec3),
+        pair_arm_j: wp.array(dtype=vec3),
+        list_pos: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        node_force_out: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        fiber = wp.tid() + offset
+        g = groups[fiber_group[fiber]]
+        first = fiber_node_start[fiber]
+        segments = g.segments
+        last = first + segments
+        flow_gradient = gradient[0]
+        spin = flow_spin(flow_gradient)
+
+        # First walk: forces on the nodes before, at and after the joint under way.
+        f_before = vec3(zero, zero, zero)
+        f_here = vec3(zero, zero, zero)
+        x0 = node_pos[first]
+        v0 = node_velocity[first]
+        n0 = vec3(zero, zero, zero)
+        d0 = one
+        longest = zero
+        center = x0
+        sum_first = vec3(zero, zero, zero)
+        sum_last = vec3(zero, zero, zero)
+        for k in range(segments):
+            i = first + k
+            x1 = node_pos[i + 1]
+            v1 = node_velocity[i + 1]
+            edge = x1 - x0
+            d1 = wp.length(edge)
+            n1 = edge / d1
+            if not (d1 < tear * g.rest):
+                longest = two * tear * g.rest
+            longest = wp.max(longest, d1)
+
+            weight = g.weight
+            if k == 0:
+                weight += g.weight_excess
+            if k == segments - 1:
+                weight += g.weight_excess
+            couple = torque_couple(g.torque * weight, n1, d1, v1 - v0, spin)
+            pull = stretching_force(g.stretching, d1, g.rest, n1)
+            f_here += pull - couple
+            f_after = couple - pull
+            if wp.static(has_pairs):
+                total, second = gather_pairs(
+                    i - fiber,
+                    out_start,
+                    in_start,
+                    in_pair,
+                    pair_force,
+                    pair_closest,
+                    pair_arm_i,
+                    pair_arm_j,
+                )
+                f_here += total - second
+                f_after += second
+            if k > 0:
+                before, after = bending_forces(g.bending, n0, d0, n1, d1)
+                f_before += before
+                f_here -= before + after
+                f_after += after
+                node_force_out[i - 1] = f_before + wall_force(
+                    node_pos[i - 1], g.radius, wall_low, wall_high, strength, decay
+                )
+            if wp.static(is_paper):
+                center += x1
+                sum_first += real(segments - k) * n1
+                sum_last += real(k + 1) * n1
+            f_before = f_here
+            f_here = f_after
+            x0 = x1
+            v0 = v1
+            n0 = n1
+            d0 = d1
+        node_force_out[last - 1] = f_before + wall_force(
+            node_pos[last - 1], g.radius, wall_low, wall_high, strength, decay
+        )
+        node_force_out[last] = f_here + wall_force(
+            x0, g.radius, wall_low, wall_high, strength, decay
+        )
+        if not (longest < tear * g.rest):
+            status[wp.static(TORN)] = 1
+            status[wp.static(BAD_FIBER)] = fiber
+            return
+
+        # Second walk: closure. `node_force_out` becomes the force per bead mass that moves the
+        # node.
+        if wp.static(is_consistent):
+            y = node_force_out[first] * pivots[g.pivot_start]
+            node_force_out[first] = y
+            for k in range(1, segments + 1):
+                y = (node_force_out[first + k] - g.coupling * y) * pivots[g.pivot_start + k]
+                node_force_out[first + k] = y
+            for k in range(1, segments + 1):
+                i = last - k
+                y = node_force_out[i] - g.coupling * pivots[g.pivot_start + segments - k] * y
+                node_force_out[i] = y
+
+        n_seg = real(segments)
+        alpha_r = one
+        alpha_t = one
+        if wp.static(is_paper):
+            center = center / (n_seg + one)
+            alpha_t = translation_factor(g.spacing, n_seg)
+            reduced = g.spacing - one
+            squares = zero
+            beads = zero
+            for k in range(segments):
+                r = node_pos[first + k] - center
+                edge = node_pos[first + k + 1] - node_pos[first + k]
+                rr = wp.dot(r, r)
+                squares += rr
+                beads += rr + two * g.radius * reduced * wp.dot(r, edge) / wp.length(edge)
+            r_end = node_pos[last] - center
+            rr_end = wp.dot(r_end, r_end)
+            squares += rr_end
+            alpha_r = (real(3.0) * squares) / (
+                real(3.0) * (rr_end + g.spacing * beads)
+                + two * g.radius * g.radius * n_seg * reduced * g.spacing * (two * reduced + one)
+            )
+
+        affine = mat33(deformation[0])
+        limit = skin_limit(affine, skin, list_reach)
+        furthest = zero
+        partial = vec3(zero, zero, zero)
+        n_before = vec3(zero, zero, zero)
+        n_after = vec3(zero, zero, zero)
+        for k in range(segments + 1):
+            i = first + k
+            x = node_pos[i]
+            v = node_velocity[i]
+            distributed = drag_force(g.drag, flow_velocity(flow_gradient, flow_origin, x), v)
+            if wp.static(has_gravity):
+                distributed += g.body_force
+            force = node_force_out[i]
+            if wp.static(is_paper):
+                if k < segments:
+                    n_after = wp.normalize(node_pos[i + 1] - x)
+                inner = partial - sum_first / (n_seg + one)
+                rotation = inner_rotation_factor(g.spacing, inner, n_after - n_before)
+                is_end = k == 0 or k == segments
+                if k == 0:
+                    rotation = end_rotation_factor(g.spacing, n_seg, sum_first, n_after)
+                if k == segments:
+                    rotation = end_rotation_factor(g.spacing, n_seg, sum_last, n_before)
+                radial = x - center
+                force = split_force(force, radial, alpha_t, alpha_r)
+                translation = distributed_translation_factor(g.spacing, n_seg, is_end)
+                distributed = split_force(distributed, radial, translation, alpha_r * rotation)
+                partial += n_after
+                n_before = n_after
+            v = v + (dt / g.mass) * (distributed + force)
+            x = x + dt * v
+            node_velocity[i] = v
+            node_pos[i] = x
+            if wp.static(has_pairs):
+                moved = x - flow_origin - affine * (list_pos[i] - flow_origin)
+                furthest = wp.max(furthest, wp.length_sq(moved))
+        if wp.static(has_pairs):
+            if limit < zero or furthest > limit * limit:
+                status[wp.static(EXPIRED)] = 1
+
+    return node_sweep

@@ -1,0 +1,319 @@
+"""One sweep over listed pairs: capsule repulsion and bead lubrication between two segments.
+
+One thread owns a segment and its outgoing pairs. It stores per pair the force on the owner and
+where it acts; the node sweep gathers, so nothing is added atomically and the result does not depend
+on the number of workers. `closest`: force and the fractions (s, t) of the one point pair. `arms`:
+several bead pairs act, so the sums of s F and t F are stored instead.
+
+Source: Sasayama & Inagaki 2018, Appendix A. Beads: a segment owns its first node and its inner
+    beads, the last segment also the last node, so that no bead counts twice. One repulsion per
+    local minimum of the distance between two fibers (the vertex rule of `is_local_minimum`).
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from warpfiber.laws.lubrication import INNER, OUTER, make_lubrication
+from warpfiber.laws.repulsion import RANGE, make_repulsion
+from warpfiber.laws.segment_distance import make_segment_distance
+from warpfiber.model import HALT, precision
+from warpfiber.passes.precision import group_struct
+
+IMAGE_BITS = 10  # per axis, offset by half: images -512 ... 511
+TOUCHES, REPELS, LUBRICATES = 1, 2, 4  # bits of the pair measurement
+# How near a fraction counts as the end of a segment: where two fibers cross exactly at a node,
+# rounding would otherwise make neither or both of the two segments report the contact.
+END_TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
+
+
+@dataclass(frozen=True)
+class PairFeatures:
+    """What the pair sweep of a scene contains."""
+
+    repulsion: bool = True
+    lubrication: str = "none"  # none, paper, shifted
+    periodic: bool = False
+    sheared: bool = False  # images move: relative velocity needs the lattice velocity
+
+    @property
+    def storage(self) -> str:
+        """How forces are stored: `closest` or `arms`."""
+        return "closest" if self.lubrication == "none" else "arms"
+
+
+def image_code(x: int, y: int, z: int) -> int:
+    """Three image numbers in one int32."""
+    half = 1 << (IMAGE_BITS - 1)
+    return (x + half) | (y + half) << IMAGE_BITS | (z + half) << (2 * IMAGE_BITS)
+
+
+NO_IMAGE = image_code(0, 0, 0)
+
+
+@cache
+def make_image(name: str):
+    """Device versions of `image_code` and its inverse."""
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    half = 1 << (IMAGE_BITS - 1)
+    mask = (1 << IMAGE_BITS) - 1
+    bits = IMAGE_BITS
+
+    @wp.func
+    def pack_image(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
+        return (
+            (x + wp.static(half))
+            | ((y + wp.static(half)) << wp.static(bits))
+            | ((z + wp.static(half)) << wp.static(2 * bits))
+        )
+
+    @wp.func
+    def unpack_image(code: wp.int32) -> vec3:
+        x = (code & wp.static(mask)) - wp.static(half)
+        y = ((code >> wp.static(bits)) & wp.static(mask)) - wp.static(half)
+        z = ((code >> wp.static(2 * bits)) & wp.static(mask)) - wp.static(half)
+        return vec3(real(x), real(y), real(z))
+
+    return pack_image, unpack_image
+
+
+@cache
+def make_pair_geometry(name: str, features: PairFeatures):
+    """Functions shared by the sweep and the measurement: distance vector, local minimum, beads."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    closest_fractions = make_segment_distance(name)
+    _, unpack_image = make_image(name)
+    lubrication_resistance = make_lubrication(name)
+    zero, one = real(0.0), real(1.0)
+    periodic = features.periodic
+    inner, outer = real(INNER), real(OUTER)
+    near = real(END_TOLERANCE[name])
+    shift = real(1.0 if features.lubrication == "shifted" else 0.0)
+
+    @wp.func
+    def image_shift(code: wp.int32, lattice: mat33) -> vec3:
+        if wp.static(periodic):
+            if code != wp.static(NO_IMAGE):
+                return lattice * unpack_image(code)
+        return vec3(zero, zero, zero)
+
+    @wp.func
+    def is_local_minimum(
+        st: vec2,
+        c: vec3,
+        node_i: wp.int32,
+        at_i: wp.int32,
+        segments_i: wp.int32,
+        node_j: wp.int32,
+        at_j: wp.int32,
+        segments_j: wp.int32,
+        node_pos: wp.array(dtype=vec3),
+    ) -> wp.bool:
+        """Vertex rule: neighbors along a fiber share a node; only one of them may report it."""
+        if st[0] >= one - near and at_i < segments_i - 1:
+            return False
+        if st[1] >= one - near and at_j < segments_j - 1:
+            return False
+        if st[0] <= near and at_i > 0:
+            back = node_pos[node_i] - node_pos[node_i - 1]
+            if wp.dot(c, back) < -near * wp.dot(back, back):
+                return False
+        if st[1] <= near and at_j > 0:
+            back = node_pos[node_j] - node_pos[node_j - 1]
+            if wp.dot(c, back) > near * wp.dot(back, back):
+                return False
+        return True
+
+    @wp.func
+    def bead_fraction(k: wp.int32, inner_beads: wp.int32) -> real:
+        return real(k) / real(inner_beads + 1)
+
+    @wp.func
+    def bead_count(g: Group, at: wp.int32) -> wp.int32:
+        """Beads owned by the segment `at` of its fiber."""
+        count = g.inner_beads + 1
+        if at == g.segments - 1:
+            count += 1
+        return count
+
+    @wp.func
+    def lubricate(
+        gi: Group,
+        gj: Group,
+        at_i: wp.int32,
+        at_j: wp.int32,
+        delta: vec3,
+        a: vec3,
+        b: vec3,
+        vi0: vec3,
+        vi1: vec3,
+        vj0: vec3,
+        vj1: vec3,
+        dt: real,
+    ):
+        """Force on segment i, its moments (sum of s F, sum of t F), number of bead pairs."""
+        force = vec3(zero, zero, zero)
+        arm_i = vec3(zero, zero, zero)
+        arm_j = vec3(zero, zero, zero)
+        active = wp.int32(0)
+        contact = gi.radius + gj.radius
+        reach = outer * contact
+        nearest = inner * contact
+        narrow = gi.radius * gj.radius / contact
+        scale = (gi.drag / gi.radius) * narrow * narrow
+        inverse_mass_dt = dt * (one / gi.mass + one / gj.mass)
+        count_i = bead_count(gi, at_i)
+        count_j = bead_count(gj, at_j)
+        bb = wp.dot(b, b)
+        for m in range(count_i):
+            s = bead_fraction(m, gi.inner_beads)
+            weight_i = one
+            if m > 0 and m <= gi.inner_beads:
+                weight_i = gi.bead_weight
+            c0 = delta - s * a
+            # beads of j within reach of this bead lie around its foot on the line of j
+            foot = -wp.dot(c0, b) / bb
+            off_line = wp.length_sq(c0 + foot * b)
+            if off_line > reach * reach:
+                continue
+            span = wp.sqrt((reach * reach - off_line) / bb)
+            per_bead = real(gj.inner_beads + 1)
+            n_first = wp.max(wp.int32(wp.ceil((foot - span) * per_bead)), 0)
+            n_last = wp.min(wp.int32(wp.floor((foot + span) * per_bead)), count_j - 1)
+            for n in range(n_first, n_last + 1):
+                t = bead_fraction(n, gj.inner_beads)
+                weight = weight_i
+                if n > 0 and n <= gj.inner_beads:
+                    weight *= gj.bead_weight
+                c = c0 + t * b
+                distance = wp.length(c)
+                if distance < nearest or distance > reach:
+                    continue
+                direction = c / distance
+                velocity = (one - t) * vj0 + t * vj1 - (one - s) * vi0 - s * vi1
+                resistance = lubrication_resistance(
+                    scale, distance, contact, shift, inverse_mass_dt
+                )
+                f = (weight * resistance * wp.dot(velocity, direction)) * direction
+                force += f
+                arm_i += s * f
+                arm_j += t * f
+                active += 1
+        return force, arm_i, arm_j, active
+
+    return closest_fractions, image_shift, is_local_minimum, lubricate
+
+
+@cache
+def make_pair_sweep(name: str, features: PairFeatures):
+    """Kernel `pair_sweep` in the given precision with the given features."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    closest_fractions, image_shift, is_local_minimum, lubricate = make_pair_geometry(name, features)
+    repulsion_size, _ = make_repulsion(name)
+    zero = real(0.0)
+    repulsion_range, lubrication_range = real(RANGE), real(OUTER)
+    has_repulsion = features.repulsion
+    has_lubrication = features.lubrication != "none"
+    sheared = features.sheared
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def pair_sweep(
+        offset: wp.int32,
+        dt: real,
+        strength: real,
+        decay: real,
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=mat33),
+        lattice: wp.array(dtype=mat33),
+        out_start: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        pair_force_out: wp.array(dtype=vec3),
+        pair_closest_out: wp.array(dtype=vec2),
+        pair_arm_i_out: wp.array(dtype=vec3),
+        pair_arm_j_out: wp.array(dtype=vec3),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        i = wp.tid() + offset
+        begin = out_start[i]
+        end = out_start[i + 1]
+        if begin == end:
+            return
+        node_i = segment_node[i]
+        fiber_i = segment_fiber[i]
+        gi = groups[fiber_group[fiber_i]]
+        at_i = node_i - fiber_node_start[fiber_i]
+        xi = node_pos[node_i]
+        a = node_pos[node_i + 1] - xi
+        for k in range(begin, end):
+            j = pair_j[k]
+            node_j = segment_node[j]
+            xj = node_pos[node_j]
+            b = node_pos[node_j + 1] - xj
+            shift = image_shift(pair_image[k], lattice[0])
+            delta = xj - xi + shift
+            st = closest_fractions(delta, a, b)
+            c = delta + st[1] * b - st[0] * a
+            dd = wp.length_sq(c)
+            fiber_j = segment_fiber[j]
+            gj = groups[fiber_group[fiber_j]]
+            contact = gi.radius + gj.radius
+            at_j = node_j - fiber_node_start[fiber_j]
+            force = vec3(zero, zero, zero)
+            if wp.static(has_repulsion):
+                reach = repulsion_range * contact
+                if dd <= reach * reach:
+                    if is_local_minimum(
+                        st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
+                    ):
+                        distance = wp.sqrt(dd)
+                        direction = wp.normalize(c)
+                        if dd == zero:
+                            direction = wp.normalize(wp.cross(a, b))
+                        force = -repulsion_size(strength, decay, distance, contact) * direction
+            if wp.static(has_lubrication):
+                arm_i = st[0] * force
+                arm_j = st[1] * force
+                reach = lubrication_range * contact
+                if dd <= reach * reach:
+                    moving = vec3(zero, zero, zero)
+                    if wp.static(sheared):
+                        moving = gradient[0] * shift
+                    squeeze, squeeze_i, squeeze_j, active = lubricate(
+                        gi,
+                        gj,
+                        at_i,
+                        at_j,
+                        delta,
+                        a,
+                        b,
+                        node_velocity[node_i],
+                        node_velocity[node_i + 1],
+                        node_velocity[node_j] + moving,
+                        node_velocity[node_j + 1] + moving,
+                        dt,
+                    )
+                    force += squeeze
+                    arm_i += squeeze_i
+                    arm_j += squeeze_j
+                pair_arm_i_out[k] = arm_i
+                pair_arm_j_out[k] = arm_j
+            else:
+                pair_closest_out[k] = st
+            pair_force_out[k] = force
+
+    return pair_sweep

@@ -1,0 +1,8 @@
+"""Where the fibers are at the start: from statistics or a file, without overlap. Host, NumPy."""
+
+from __future__ import annotations
+
+from warpfiber.placement.insertion import Cell
+from warpfiber.placement.packing import Placement, overlap_of, place_fibers, scene_cell
+
+__all__ = ["Placement", "place_fibers", "Cell", "scene_cell", "overlap_of"]

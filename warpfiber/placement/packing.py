@@ -1,0 +1,339 @@
+"""Places all fibers of a scene: straight ones from statistics, others from a file, without overlap.
+
+Order: node files, then given centers, then random centers, longest fibers first. Random fibers are
+inserted one by one, each with its own direction. When no free center is found for one, a batch of
+fibers goes in where they overlap least, all fibers are relaxed by small translations and rotations,
+and insertion goes on.
+
+Symbols: A orientation tensor, h half centerline length (m), a radius (m).
+Limits: a direction that does not fit between the walls, or that makes a fiber hit its own image, is
+    drawn again: A loses directions across the gap; `report` has the tensor achieved.
+    Centers are uniform in what the walls leave; ends may stick out of open faces. With contact law
+    `none` fibers do not see each other: what cannot be packed then overlaps.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpfiber.placement.capsules import Capsules, Floats, Ints, chain_capsules, near_pairs
+from warpfiber.placement.capsules import pair_gap as gaps_of
+from warpfiber.placement.groups import GroupFibers, group_fibers
+from warpfiber.placement.insertion import Cell, Inserted, Trial
+from warpfiber.placement.orientations import orientation_tensor, values_from_tensor
+from warpfiber.placement.relaxation import Freedom, relax
+from warpfiber.placement.shapes import straight_nodes
+from warpfiber.scene import Fault, Scene, SceneError
+
+LINES = 256
+"""Random lines searched for a free center before insertion counts as stalled."""
+BEST_OF = 64
+"""Random centers of which a fiber without free center takes the one that overlaps least."""
+BATCH = 0.2
+"""Part of all random fibers that goes in overlapping between two relaxations."""
+LAST_BATCH = 0.02
+"""The same where larger batches jam; if this one jams too, the cell is full."""
+FEWEST = 4
+"""Smallest batch, fibers."""
+SWEEPS = 6000
+"""Most sweeps of one relaxation."""
+DIRECTION_DRAWS = 500
+"""Directions tried for a fiber with a given center that another one is in the way of."""
+FILE_OVERLAP = 0.2
+"""Deepest overlap accepted in a node file (radii); a penalty of decay 50 is then 150 D_0."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Fibers at the start, all groups one after the other."""
+
+    node_pos: Floats
+    """m, (N, 3)"""
+    fiber_node_start: NDArray[np.int32]
+    """first node of each fiber, and N, (F + 1,)"""
+    fiber_group: NDArray[np.int32]
+    """(F,)"""
+    report: dict[str, Any] = field(default_factory=dict)
+    """orientation tensors, tries, relaxations, seconds; JSON-ready"""
+
+
+def place_fibers(scene: Scene, rng: np.random.Generator | None = None) -> Placement:
+    """Fibers of a scene, always the same for one seed.
+
+    Capsules keep 2a (1 + 1e-3) between axes, periodic images included, and a (1 + 1e-3) from walls.
+    Raises SceneError: what cannot be packed, does not fit, or cannot be read.
+    """
+    began = time.perf_counter()
+    rng = np.random.default_rng(scene.seed) if rng is None else rng
+    cell = scene_cell(scene)
+    groups = group_fibers(scene, cell, rng)
+    packing = _Packing(scene, cell, groups, rng)
+    packing.insert_files()
+    packing.insert_given()
+    packing.insert_random()
+    return packing.placement(began)
+
+
+def scene_cell(scene: Scene) -> Cell:
+    """Size and kinds of boundary of the scene's box."""
+    if scene.box is None:
+        return Cell(None, np.zeros(3, dtype=bool), np.zeros(3, dtype=bool))
+    kinds = np.array(scene.box.boundary)
+    return Cell(np.array(scene.box.size, dtype=np.float64), kinds == "periodic", kinds == "wall")
+
+
+def overlap_of(
+    node_pos: Floats, fiber_node_start: NDArray[np.integer[Any]], fiber_radius: Floats, cell: Cell
+) -> dict[str, float]:
+    """Overlaps of fibers: `pairs` that touch, `maximum` and `mean` depth in radii.
+
+    node_pos (N, 3) m, fiber_node_start (F + 1,), fiber_radius (F,) m. A pair is two segments of two
+    fibers, or of one fiber and its image; bends of one fiber onto itself do not count.
+    """
+    capsules = chain_capsules(node_pos, fiber_node_start, fiber_radius)
+    pairs = near_pairs(capsules, 0.0, cell.size, cell.periodic)
+    if not len(pairs.i):
+        return {"pairs": 0, "maximum": 0.0, "mean": 0.0}
+    mean_radius = 0.5 * (capsules.radius[pairs.i] + capsules.radius[pairs.j])
+    depth = -gaps_of(capsules, pairs, cell.size) / mean_radius
+    return {"pairs": len(depth), "maximum": float(depth.max()), "mean": float(depth.mean())}
+
+
+class _Packing:
+    """Fibers of one scene while they are placed."""
+
+    def __init__(
+        self, scene: Scene, cell: Cell, groups: list[GroupFibers], rng: np.random.Generator
+    ) -> None:
+        self.scene, self.cell, self.groups, self.rng = scene, cell, groups, rng
+        self.apart = scene.contact.law != "none"
+        self.sweeps = self.relaxations = self.squeezed = 0
+        halves = [float(g.half) for g in groups if len(g.direction)]
+        self.longest = max(halves, default=0.0)
+        self.widest = max((g.radius for g in groups), default=0.0)
+        self.held: list[Capsules] = []
+        self.placed = Inserted(cell, self.longest, self.widest)
+
+    def _fault(self, group: int, key: str, value: object, remedy: str) -> SceneError:
+        return SceneError([Fault(self.scene.path, f"fibers.{group}.{key}", value, remedy)])
+
+    def _hold(self, capsules: Capsules) -> None:
+        self.held.append(capsules)
+        for k in range(len(capsules)):
+            self.placed.add(
+                capsules.center[k],
+                capsules.direction[k],
+                float(capsules.half[k]),
+                float(capsules.radius[k]),
+            )
+
+    def insert_files(self) -> None:
+        """Fibers of node files, as they are; a deep overlap between them is a fault."""
+        for g in self.groups:
+            if not g.nodes:
+                continue
+            start = np.cumsum([0] + [len(n) for n in g.nodes])
+            self._hold(
+                chain_capsules(np.concatenate(g.nodes), start, np.full(len(g.nodes), g.radius))
+            )
+        if not self.held or not self.apart:
+            return
+        last = max(g.index for g in self.groups if g.nodes)
+        capsules = _joined(self.held)
+        pairs = near_pairs(capsules, 0.0, self.cell.size, self.cell.periodic)
+        if not len(pairs.i):
+            return
+        depth = float(-gaps_of(capsules, pairs, self.cell.size).min()) / self.widest
+        if depth > FILE_OVERLAP:
+            raise self._fault(
+                last,
+                "node_file",
+                self.scene.fibers[last].node_file,
+                f"its fibers overlap by up to {depth:.3g} radii (at most {FILE_OVERLAP}); "
+                'move them apart, or contact.law = "none"',
+            )
+
+    def insert_given(self) -> None:
+        """Fibers with given centers; a direction in the way of another fiber is drawn again."""
+        for g in self.groups:
+            if g.given is None:
+                continue
+            for f in range(len(g.direction)):
+                draws = 0
+                while self.apart:
+                    trial = Trial(self.placed, g.direction[f], g.half, g.radius)
+                    if not len(trial.overlaps(g.given[f][None, :])[0]):
+                        break
+                    draws += 1
+                    fresh = None if draws > DIRECTION_DRAWS else g.redraw(f, self.rng)
+                    if fresh is None:
+                        raise self._fault(
+                            g.index,
+                            "position",
+                            tuple(float(x) for x in g.given[f]),
+                            f"fiber {f} would overlap another one there; move it, "
+                            'or contact.law = "none"',
+                        )
+                    g.direction[f] = fresh
+                self.placed.add(g.given[f], g.direction[f], g.half, g.radius)
+            g.center = g.given.copy()
+            n = len(g.direction)
+            self.held.append(
+                Capsules(
+                    g.center,
+                    g.direction,
+                    np.full(n, g.half),
+                    np.full(n, g.radius),
+                    np.arange(n),
+                )
+            )
+
+    def insert_random(self) -> None:
+        """Fibers with random centers, longest first; from the first stall on in batches."""
+        random = [g for g in self.groups if g.given is None and not g.nodes]
+        queue = [(g, f) for g in random for f in range(len(g.direction))]
+        queue.sort(key=lambda item: -item[0].half)
+        batch = max(FEWEST, int(BATCH * len(queue)))
+        fewest = max(FEWEST, int(LAST_BATCH * len(queue)))
+        done, jammed = 0, False
+        while done < len(queue):
+            if not jammed:
+                done += self._insert_free(queue[done:])
+            more = min(batch, len(queue) - done)
+            for g, f in queue[done : done + more]:
+                low, high = self.cell.center_range(g.direction[f], g.half, g.radius)
+                trial = Trial(self.placed, g.direction[f], g.half, g.radius)
+                self._place(g, f, trial.least_overlap(low, high, BEST_OF, self.rng))
+            if more and self.apart:
+                jammed = not self._relax(queue[: done + more])
+                self._restore(queue[: done + (0 if jammed else more)])
+            if jammed and batch <= fewest:
+                self._jammed(queue[done][0].index, done, len(queue))
+            if jammed:
+                batch = max(fewest, batch // 3)
+            else:
+                done += more
+                self.squeezed += more
+
+    def _insert_free(self, queue: list[tuple[GroupFibers, int]]) -> int:
+        """Places fibers at free centers until there is none for one; how many."""
+        for k, (g, f) in enumerate(queue):
+            low, high = self.cell.center_range(g.direction[f], g.half, g.radius)
+            trial = Trial(self.placed, g.direction[f], g.half, g.radius)
+            center, tries = trial.free_center(low, high, self.rng, LINES)
+            g.tries += tries
+            if center is None:
+                return k
+            self._place(g, f, center)
+        return len(queue)
+
+    def _place(self, g: GroupFibers, f: int, center: Floats) -> None:
+        g.center[f] = center
+        self.placed.add(center, g.direction[f], g.half, g.radius)
+
+    def _relax(self, done: list[tuple[GroupFibers, int]]) -> bool:
+        """Parts overlapping fibers; False, and nothing moved, if they jam."""
+        loose = Capsules(
+            np.array([g.center[f] for g, f in done]),
+            np.array([g.direction[f] for g, f in done]),
+            np.array([g.half for g, _ in done]),
+            np.array([g.radius for g, _ in done]),
+            np.arange(len(done)),
+        )
+        capsules = _joined([loose, *self.held])
+        n = len(done)
+        freedom = Freedom(np.zeros(len(capsules)), np.zeros((len(capsules), 3, 3)))
+        freedom.translation[:n] = 1.0
+        freedom.rotation[:n] = np.array([g.turning for g, _ in done])
+        clear, sweeps = relax(capsules, self.cell, freedom, SWEEPS)
+        self.sweeps += sweeps
+        self.relaxations += 1
+        for k, (g, f) in enumerate(done if clear else []):
+            g.center[f] = capsules.center[k]
+            g.direction[f] = capsules.direction[k]
+        return clear
+
+    def _jammed(self, index: int, placed: int, asked: int) -> None:
+        """Raises SceneError with how many fibers could be packed."""
+        group = self.scene.fibers[index]
+        reached = f"only about {placed} of {asked} fibers could be placed without overlap"
+        remedy = "ask for less, or for shorter or more aligned fibers"
+        if group.volume_fraction is None:
+            raise self._fault(index, "count", group.count, f"{reached}; {remedy}")
+        shares = [g.volume_fraction_achieved or 0.0 for g in self.scene.fibers]
+        fraction = f"volume fraction {placed / asked * sum(shares):.3g} was reached"
+        raise self._fault(
+            index, "volume_fraction", group.volume_fraction, f"{reached}, {fraction}; {remedy}"
+        )
+
+    def _restore(self, done: list[tuple[GroupFibers, int]]) -> None:
+        """Wraps centers into the box and lists all images again after fibers have moved."""
+        size, periodic = self.cell.size, self.cell.periodic
+        self.placed = Inserted(self.cell, self.longest, self.widest)
+        held, self.held = self.held, []
+        for capsules in held:
+            self._hold(capsules)
+        for g, f in done:
+            if size is not None:
+                g.center[f] -= np.where(periodic, np.floor(g.center[f] / size) * size, 0.0)
+            self.placed.add(g.center[f], g.direction[f], g.half, g.radius)
+
+    def placement(self, began: float) -> Placement:
+        """Nodes of all groups in the order of the scene, and the report."""
+        nodes: list[Floats] = []
+        counts: list[int] = []
+        owner: list[int] = []
+        for g in self.groups:
+            chains = g.nodes or list(
+                straight_nodes(g.center, g.direction, 2.0 * g.half, g.segments)
+            )
+            nodes += chains
+            counts += [len(chain) for chain in chains]
+            owner += [g.index] * len(chains)
+        node_pos = np.concatenate(nodes) if nodes else np.zeros((0, 3))
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        radius = np.array([self.groups[g].radius for g in owner])
+        # Fibers that do not see each other may all lie on one point: counting pairs would not end.
+        overlap = overlap_of(node_pos, start, radius, self.cell) if self.apart and owner else None
+        report = {
+            "groups": [_group_report(g) for g in self.groups],
+            "overlap": overlap,
+            "inserted_overlapping": self.squeezed,
+            "relaxations": self.relaxations,
+            "relaxation_sweeps": self.sweeps,
+            "seconds": round(time.perf_counter() - began, 3),
+        }
+        return Placement(node_pos, start, np.array(owner, dtype=np.int32), report)
+
+
+def _group_report(g: GroupFibers) -> dict[str, Any]:
+    if g.nodes:
+        step = np.concatenate([np.diff(chain, axis=0) for chain in g.nodes])
+        directions = step / np.linalg.norm(step, axis=1)[:, None]
+    else:
+        directions = g.direction
+    return {
+        "count": len(g.nodes) or len(g.direction),
+        "orientation_asked": None if g.tensor is None else values_from_tensor(g.tensor),
+        "orientation_drawn": None if g.drawn is None else values_from_tensor(g.drawn),
+        "orientation_achieved": values_from_tensor(orientation_tensor(directions)),
+        "directions_redrawn": g.redrawn,
+        "tries": g.tries,
+    }
+
+
+def _joined(parts: list[Capsules]) -> Capsules:
+    """Capsules one after the other; owners stay distinct."""
+    first: Ints = np.cumsum([0] + [int(part.owner.max()) + 1 for part in parts])
+    return Capsules(
+        np.concatenate([part.center for part in parts]),
+        np.concatenate([part.direction for part in parts]),
+        np.concatenate([part.half for part in parts]),
+        np.concatenate([part.radius for part in parts]),
+        np.concatenate([part.owner + first[k] for k, part in enumerate(parts)]),
+    )

@@ -1,0 +1,69 @@
+"""What the scene schema knows but this version cannot run yet: one table, one row per key.
+
+The keys are read and checked like all others, so that a scene of a later version gets an honest
+answer instead of "unknown key". A version that adds a feature removes its row or adds its word.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """The values of `table.key` that run now (none: the key itself does not), and advice."""
+
+    table: str
+    key: str
+    available: tuple[object, ...]
+    advice: str
+
+
+METHOD_ADVICE = 'use method = "bead_chain"'
+FIBER_ADVICE = "give several [[fibers]] groups instead"
+STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
+
+NOT_IN_THIS_VERSION: tuple[Row, ...] = (
+    Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
+                         "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
+    Row("fibers", "layers", (), FIBER_ADVICE),
+    Row("fibers", "length_distribution", (), FIBER_ADVICE),
+    Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
+    Row("fibers", "frozen", (False,), "remove it; all fibers move"),
+    Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
+    Row("contact", "law", ("none", "exponential"), 'use law = "exponential" or "none"'),
+    Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
+    Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+    Row("stage", "kind", ("flow",), STAGE_ADVICE),
+    Row("stage", "end_speed", (), STAGE_ADVICE),
+    Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
+    Row("stage", "end_pressure", (), STAGE_ADVICE),
+    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
+    Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
+                                 "interactions", "axial_strain", "energy", "rotation"),
+        "remove the others from the list"),
+    Row("record", "node_fields", ("velocity",), "remove the others from the list"),
+    Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
+    Row("numerics", "method", ("bead_chain",), METHOD_ADVICE),
+    Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
+    Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
+    Row("load", "", (), "remove the table; fibers move freely"),
+    Row("start", "", (), "remove the table and give [[fibers]]"),
+)  # fmt: skip
+
+
+def unavailable(table: str, key: str, value: object) -> str | None:
+    """Return what to do instead if this version cannot run `table.key = value`, else None.
+
+    An empty `key` asks for the table as a whole; of a list every entry must be available.
+    """
+    for row in NOT_IN_THIS_VERSION:
+        if (row.table, row.key) != (table, key):
+            continue
+        entries = value if isinstance(value, tuple) else (value,)
+        missing = [entry for entry in entries if entry not in row.available]
+        if missing or not row.available:
+            names = ", ".join(str(entry) for entry in missing) if row.available else ""
+            subject = f"{names} is " if isinstance(value, tuple) and names else ""
+            return f"{subject}not available in this version; {row.advice}"
+    return None

@@ -1,0 +1,216 @@
+"""Rules between keys and tables: each function looks at one thing that can go wrong together.
+
+Limits: what the scene alone shows. The stable time step, the device and the packing of fibers need
+more than the scene and are checked later.
+"""
+
+from __future__ import annotations
+
+import math
+
+from warpfiber.scene.derived import reach
+from warpfiber.scene.draft import Draft
+from warpfiber.scene.faults import number_text
+from warpfiber.scene.keys import Values
+from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
+
+AXES = "xyz"
+HOPELESS_FRACTION = 0.9
+"""Volume fraction that no packing of straight fibers reaches: touching parallel cylinders fill
+pi/(2 sqrt 3) = 0.907."""
+WALL_GAP = 1e-3
+"""Gap kept to walls by the placement, in radii."""
+
+
+def cross_check(draft: Draft) -> None:
+    """Run all rules; faults and notes go to the draft's list."""
+    _check_tables(draft)
+    _check_flow(draft)
+    _check_flow_in_box(draft)
+    _check_periodic_edges(draft)
+    for index, group in enumerate(draft.fibers):
+        _check_walls(draft, group, f"fibers.{index}")
+        _check_self_contact(draft, group, f"fibers.{index}")
+        _check_positions(draft, group, f"fibers.{index}")
+    _check_filling(draft)
+    _check_contact(draft)
+    _check_stages(draft)
+    _check_rest(draft)
+
+
+def _check_tables(draft: Draft) -> None:
+    """Ask for the tables that a scene, or its method, cannot do without."""
+    if draft.start is not None:
+        for name in ("fibers", "box"):
+            if draft.is_given(name):
+                draft.faults.add(name, None, "given together with [start]; [start] brings it")
+    elif not draft.fibers and not draft.faulty("fibers"):
+        draft.faults.add("fibers", None, "missing; add at least one [[fibers]]")
+    if not draft.stages and not draft.faulty("stage"):
+        draft.faults.add("stage", None, 'missing; add a [[stage]] with kind = "flow"')
+    if draft.method == "bead_chain" and not draft.is_given("flow"):
+        remedy = 'add [flow] with kind and viscosity (kind = "rest" for a still fluid)'
+        draft.faults.add("flow", None, f"missing: bead_chain moves fibers by drag; {remedy}")
+
+
+def _check_flow(draft: Draft) -> None:
+    """The gradient is of an incompressible fluid and not zero; the schedule lets strain grow."""
+    if draft.flow is None:
+        return
+    gradient = draft.flow["gradient"]
+    if gradient is not None:
+        largest = max(abs(entry) for row in gradient for entry in row)
+        trace = gradient[0][0] + gradient[1][1] + gradient[2][2]
+        if largest == 0.0:
+            draft.blame("flow.gradient", 'all entries are 0; use kind = "rest"')
+        elif abs(trace) > 1e-9 * largest:
+            remedy = f"the diagonal sums to {number_text(trace)}; it must be 0 (incompressible)"
+            draft.blame("flow.gradient", remedy)
+    schedule = draft.flow["schedule"]
+    if schedule is not None:
+        strains = [pair[0] for pair in schedule]
+        if strains[0] < 0.0 or any(b <= a for a, b in zip(strains, strains[1:], strict=False)):
+            draft.blame("flow.schedule", "strains must grow from pair to pair and be >= 0")
+        if any(pair[1] <= 0.0 for pair in schedule):
+            draft.blame("flow.schedule", "factors must be > 0; at 0 the strain would stop there")
+
+
+def _check_flow_in_box(draft: Draft) -> None:
+    """With walls, a linear flow does not change along a periodic axis: images would differ."""
+    flow = draft.flow_object
+    gradient = flow.velocity_gradient if flow is not None else None
+    if flow is None or gradient is None or not draft.axes("wall"):
+        return
+    for axis, _ in draft.axes("periodic"):
+        if any(row[axis] != 0.0 for row in gradient):
+            remedy = f"{flow.kind} changes along the periodic axis {AXES[axis]} of a box with walls"
+            key = "box.boundary" if draft.is_given("box.boundary") else "flow.kind"
+            draft.blame(key, f"{remedy}; make that axis a wall, or all axes periodic")
+
+
+def _check_periodic_edges(draft: Draft) -> None:
+    """A periodic edge holds the longest segment and its reach, else images are missed."""
+    longest, radius = 0.0, 0.0
+    for index, group in enumerate(draft.fibers):
+        radius = max(radius, 0.5 * (group["diameter"] or 0.0))
+        if group["segments"] and group["centerline_length"]:
+            longest = max(longest, group["centerline_length"] / group["segments"])
+        for axis, edge in draft.axes("periodic"):
+            length = group["length"] or 0.0
+            if length > 0.5 * edge:
+                size = "the box" if length > edge else "half the box"
+                draft.note(f"fibers.{index}: longer than {size} along {AXES[axis]} (periodic)")
+    law, lubrication = draft.contact["law"], draft.contact["lubrication"]
+    if longest == 0.0 or law in (None, "none") or lubrication is None:
+        return
+    span = reach(law, lubrication, radius)
+    for axis, edge in draft.axes("periodic"):
+        if edge < longest + span:
+            place = draft.given("numerics", SEGMENT_KEYS).rpartition(".")[2]
+            least = number_text(float(f"{longest + span:.4g}"))
+            draft.blame(
+                "box.size",
+                f"periodic edge {AXES[axis]} is shorter than a segment + its reach = {least} m;"
+                f" enlarge it, or make segments shorter (numerics.{place})",
+            )
+
+
+def _check_walls(draft: Draft, group: Values, path: str) -> None:
+    """A fiber fits between the walls: its diameter always, its length as far as it points there."""
+    diameter, center = group["diameter"], group["centerline_length"]
+    if diameter is None or center is None:
+        return
+    thickness = diameter * (1.0 + WALL_GAP)
+    for axis, gap in draft.axes("wall"):
+        direction = group["direction"]
+        across = abs(direction[axis]) * center if direction is not None else 0.0
+        if thickness > gap:
+            key = f"{path}.diameter"
+        elif across + thickness > gap:
+            key = draft.given(path, LENGTH_KEYS)
+        else:
+            if direction is None and (group["length"] or 0.0) > gap:
+                draft.note(f"{path}: longer than the gap between the walls along {AXES[axis]}")
+            continue
+        wide = f"{number_text(gap)} m between the walls along {AXES[axis]}"
+        draft.blame(key, f"does not fit into the {wide}; shorten it, or enlarge box.size")
+
+
+def _check_self_contact(draft: Draft, group: Values, path: str) -> None:
+    """A fiber aligned with a periodic axis is shorter than the box, else it meets its image."""
+    direction, length = group["direction"], group["length"]
+    if direction is None or length is None:
+        return
+    for axis, edge in draft.axes("periodic"):
+        if abs(direction[axis]) > 1.0 - 1e-9 and length > edge:
+            key = draft.given(path, LENGTH_KEYS)
+            remedy = f"aligned along the periodic axis {AXES[axis]} it overlaps its own image"
+            draft.blame(key, f"{remedy}; enlarge box.size, or change direction")
+
+
+def _check_positions(draft: Draft, group: Values, path: str) -> None:
+    """Centers: one per fiber, inside the walls; several fibers share one only if nothing acts."""
+    position, count, key = group["position"], group["count"], f"{path}.position"
+    if position is None or group["node_file"] is not None:
+        return
+    if position == "random":
+        if draft.box is None:
+            draft.blame(key, "random needs a [box]; add one, or give the centers")
+        return
+    alone = draft.contact["law"] == "none"
+    if count is not None and len(position) != count and not (alone and len(position) == 1):
+        remedy = f"{len(position)} center(s) for {count} fibers; give one center per fiber"
+        remedy += "" if draft.is_given(key) else ", or a [box]"
+        draft.blame(key, remedy)
+    for axis, edge in draft.axes("wall") + draft.axes("open"):
+        if any(not 0.0 <= center[axis] <= edge for center in position):
+            remedy = f"a center is outside the box along {AXES[axis]}"
+            draft.blame(key, f"{remedy}; keep it between 0 and {number_text(edge)}")
+
+
+def _check_filling(draft: Draft) -> None:
+    """All groups together fill less of the box than the densest packing of cylinders."""
+    shares = [group["volume_fraction_achieved"] or 0.0 for group in draft.fibers]
+    total = math.fsum(shares)
+    if total >= HOPELESS_FRACTION:
+        fullest = shares.index(max(shares))
+        key = draft.given(f"fibers.{fullest}", COUNT_KEYS)
+        remedy = f"all fibers fill {number_text(float(f'{total:.3g}'))} of the box"
+        draft.blame(key, f"{remedy}; stay below {HOPELESS_FRACTION}")
+
+
+def _check_contact(draft: Draft) -> None:
+    """No law means no pairs, so no lubrication either."""
+    if draft.contact["law"] == "none" and draft.contact["lubrication"] in ("paper", "shifted"):
+        remedy = 'law = "none" switches off all pairs; remove it, or use law = "exponential"'
+        draft.blame("contact.lubrication", remedy)
+
+
+def _check_stages(draft: Draft) -> None:
+    """A repeat goes back to one known stage."""
+    names: list[str | None] = []
+    for index, stage in enumerate(draft.stages):
+        names.append(stage["name"])
+        place, target = f"stage.{index}.repeat_from", stage["repeat_from"]
+        if target is None:
+            if stage["repeat"] != 1:
+                draft.blame(f"stage.{index}.repeat", "needs repeat_from; name the first stage")
+        elif target not in names:
+            known = ", ".join(f'"{name}"' for name in names if name)
+            draft.blame(place, f"no such stage up to here; known: {known}")
+        elif names.count(target) > 1:
+            draft.blame(place, f'{names.count(target)} stages are named "{target}"; rename them')
+
+
+def _check_rest(draft: Draft) -> None:
+    """Without a rate the strain never grows, so nothing can wait for it."""
+    still = draft.flow is None and draft.method != "bead_chain"
+    if draft.flow_object is not None:
+        still = draft.flow_object.kind == "rest"
+    if not still:
+        return
+    for index, stage in enumerate(draft.stages):
+        if stage["end_strain"] is not None and stage["end_time"] is None:
+            draft.blame(f"stage.{index}.end_strain", "the fluid rests; end the stage by end_time")
+    if draft.record["every_strain"] is not None:
+        draft.blame("record.every_strain", "the fluid rests; use every_time or frames")

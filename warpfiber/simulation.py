@@ -1,0 +1,259 @@
+"""One simulation in memory: build, step, measure, save and restore its state. Writes no files.
+
+`job` runs a simulation into a result folder; from Python, `Simulation(scene)` is all one needs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.build import build, realized_scene
+from warpfiber.methods.bead_chain import BeadChain
+from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
+from warpfiber.passes.measurement import Measurement
+from warpfiber.placement import Placement, place_fibers
+from warpfiber.scene import Fault, Scene, SceneError
+
+CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
+
+# What a checkpoint holds: every array that the next step depends on.
+_ARRAYS = (
+    "node_pos node_velocity fiber_image lattice deformation list_pos list_lattice step time strain"
+).split()
+
+
+class Diverged(Exception):
+    """A fiber was torn: the step was too large, or the scene starts in a state that explodes."""
+
+    def __init__(self, report: Mapping[str, Any]) -> None:
+        self.report = dict(report)
+        super().__init__(report["message"])
+
+
+def choose_device(scene: Scene, segments: int) -> str:
+    """Device of the run; raises SceneError if the one asked for does not exist."""
+    wanted = scene.numerics.device
+    known = [str(device) for device in wp.get_devices()]
+    cuda = [name for name in known if name.startswith("cuda")]
+    if wanted == "auto":
+        return cuda[0] if cuda and segments >= CUDA_BREAK_EVEN else "cpu"
+    if wanted == "cuda" and cuda:
+        return cuda[0]
+    if wanted in known:
+        return wanted
+    remedy = f"no such device on this machine; there is: {', '.join(known)}"
+    raise SceneError([Fault(scene.path, "numerics.device", wanted, remedy)])
+
+
+def check_step(scene: Scene) -> tuple[float, list[StepLimit]]:
+    """Chosen dt in s and all limits; raises SceneError if dt is above the smallest limit."""
+    limits, dt = step_limits(scene), chosen_step(scene)
+    smallest = limits[0]
+    if not math.isfinite(dt):
+        remedy = "nothing limits the step of this scene; give numerics.dt in s"
+        raise SceneError([Fault(scene.path, "numerics.dt", "auto", remedy)])
+    if dt > smallest.dt and not scene.numerics.allow_unstable_dt:
+        remedy = (
+            f"above the stable limit {smallest.dt:.4g} s set by {smallest.term}; take "
+            'dt = "auto" or a smaller one, or set numerics.allow_unstable_dt = true'
+        )
+        raise SceneError([Fault(scene.path, "numerics.dt", dt, remedy)])
+    return dt, limits
+
+
+class Simulation:
+    """A scene under way. Positions and velocities are NumPy arrays in SI, fibers unwrapped."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        device: str | None = None,
+        workers: int | None = None,
+        placement: Placement | None = None,
+    ) -> None:
+        """Place the fibers and allocate; `device`, `workers` override the scene's numerics.
+
+        Raises SceneError if the device does not exist, the fibers cannot be placed or dt is not
+        stable.
+        """
+        if device is not None:
+            numerics = dataclasses.replace(scene.numerics, device=device)
+            scene = dataclasses.replace(scene, numerics=numerics)
+        choose_device(scene, 0)
+        if not any(group.node_file for group in scene.fibers):
+            check_step(scene)
+        placement = placement or place_fibers(scene)
+        self.scene = realized_scene(scene, placement)
+        self.dt, self.limits = check_step(self.scene)
+        segments = len(placement.node_pos) - len(placement.fiber_group)
+        self.device = choose_device(self.scene, segments)
+        self.model, self.state, self.placement_report = build(self.scene, self.device, placement)
+        wanted = workers if workers is not None else scene.numerics.workers
+        self.method = BeadChain(self.scene, self.model, self.state, self.dt, wanted)
+        self.measurement = Measurement(
+            self.model,
+            self.state,
+            self.scene.record.quantities,
+            self.method.pair_features,
+            self.method.strength,
+            self.method.decay,
+        )
+
+    # -- stepping ---------------------------------------------------------------------------------
+
+    def step(self, count: int = 1) -> None:
+        """Advance `count` steps of dt; raises Diverged if a fiber tears."""
+        if not self.method.advance(count):
+            raise Diverged(self._torn_report())
+
+    def run(self, until: float | None = None, *, time: float | None = None) -> None:
+        """Advance to the strain `until`, or to `time` in s; default: the end of the last stage.
+
+        The end is reached to within one step. Raises Diverged if a fiber tears.
+        """
+        if until is None and time is None:
+            until, time = self._scene_end()
+        while True:
+            steps = self.steps_to(until, time)
+            if steps <= 0:
+                return
+            self.step(steps)
+
+    def steps_to(self, strain: float | None, time: float | None) -> int:
+        """Steps that surely do not pass the first of the two marks; 0 if one is reached."""
+        counts = []
+        if strain is not None:
+            flow = self.scene.flow
+            factor = 1.0
+            if flow is not None and flow.schedule:
+                factor = max(abs(row[1]) for row in flow.schedule)
+            rate = flow.rate * factor if flow else 0.0
+            if rate == 0.0:
+                return 0
+            counts.append((strain - self.strain) / (rate * self.dt))
+        if time is not None:
+            counts.append((time - self.time) / self.dt)
+        if not counts:
+            return 0
+        # a mark counts as reached within a millionth of a step: rounding must not add a step
+        return max(0, math.ceil(min(counts) - 1e-6))
+
+    def _scene_end(self) -> tuple[float | None, float | None]:
+        stages = self.scene.stage_sequence
+        strains = [s.end_strain for s in stages]
+        if all(value is not None for value in strains):
+            return sum(value for value in strains if value is not None), None
+        times = [s.end_time for s in stages]
+        return None, sum(value for value in times if value is not None)
+
+    def close(self) -> None:
+        """Stop worker threads; the state stays readable."""
+        self.method.close()
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken since the start."""
+        return int(self.state.step.numpy()[0])
+
+    @property
+    def time(self) -> float:
+        """s since the start."""
+        return float(self.state.time.numpy()[0]) * self.model.units.time
+
+    @property
+    def strain(self) -> float:
+        """Time integral of the flow's rate."""
+        return float(self.state.strain.numpy()[0])
+
+    @property
+    def node_pos(self) -> np.ndarray:
+        """(N, 3) m, unwrapped: whole fibers follow their way through the periodic box."""
+        return self._unwrapped() * self.model.units.length
+
+    @property
+    def node_velocity(self) -> np.ndarray:
+        """(N, 3) m/s; in a sheared box that of the image inside the box."""
+        velocity: np.ndarray = self.state.node_velocity.numpy().astype(float)
+        return velocity * self.model.units.velocity
+
+    @property
+    def fiber_node_start(self) -> np.ndarray:
+        """(F+1,) first node of every fiber."""
+        start: np.ndarray = self.model.host["fiber_node_start"]
+        return start
+
+    @property
+    def lattice(self) -> np.ndarray | None:
+        """(3, 3) m, columns are the box vectors now; None without a box."""
+        if self.scene.box is None:
+            return None
+        return np.asarray(self.state.lattice.numpy()[0]) * self.model.units.length
+
+    def _unwrapped(self) -> np.ndarray:
+        counts = np.diff(self.fiber_node_start)
+        image = np.asarray(self.state.fiber_image.numpy(), dtype=float)
+        shift = image @ np.asarray(self.state.lattice.numpy()[0]).T
+        nodes = np.asarray(self.state.node_pos.numpy(), dtype=float)
+        return nodes + np.repeat(shift, counts, axis=0)
+
+    def measure(self) -> dict[str, float]:
+        """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
+        self.method.prepare()
+        row = {"step": float(self.step_count), "time": self.time, "strain": self.strain}
+        return row | self.measurement.row(self.method.list)
+
+    # -- saving -----------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of every array that the next step depends on, in run units and full precision."""
+        self.method.prepare()
+        arrays = {name: getattr(self.state, name).numpy().copy() for name in _ARRAYS}
+        if self.measurement.angle is not None:
+            arrays["angle"] = self.measurement.angle.copy()
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Continue from a snapshot exactly as the run that took it would have."""
+        state = self.state
+        for name in _ARRAYS:
+            getattr(state, name).assign(arrays[name])
+        if self.method.list is not None:
+            # the list of the snapshot was built from other positions: build the same one again
+            state.node_pos.assign(arrays["list_pos"])
+            state.lattice.assign(arrays["list_lattice"])
+            self.method.refresh_list(wrap=False)
+            for name in ("node_pos", "lattice", "deformation"):
+                getattr(state, name).assign(arrays[name])
+        state.status.fill_(0)
+        self.method.set_gradient()
+        if self.measurement.angle is not None:
+            self.measurement.angle = np.asarray(arrays["angle"])
+
+    # -- failing ----------------------------------------------------------------------------------
+
+    def _torn_report(self) -> dict[str, Any]:
+        torn = self.method.torn_fiber()
+        smallest = self.limits[0]
+        finite = {k: v for k, v in torn["terms"].items() if math.isfinite(v)}
+        force = finite.get(torn["largest_term"], math.inf)
+        torn["message"] = (
+            f"diverged at step {self.step_count}, time {self.time:.6g} s, strain "
+            f"{self.strain:.6g}: fiber {torn['fiber']} is torn at node {torn['node']} (segment at "
+            f"{torn['stretch']:.3g} times its rest length); largest term: {torn['largest_term']} "
+            f"({force:.3g} N); dt = {self.dt:.4g} s, limit {smallest.dt:.4g} s set by "
+            f"{smallest.term}"
+        )
+        return torn
+
+    def pass_times(self, repeats: int = 20) -> dict[str, float]:
+        """Seconds per step of each pass, measured on real steps (the run goes on from them)."""
+        return self.method.time_passes(repeats)
