@@ -21,18 +21,14 @@ OUTER = 1.5
 
 @cache
 def make_lubrication(name):
-    """`lubrication_resistance(scale, D, 2a, shift, dt/m1 + dt/m2)`, scale = 6 pi eta (a1
-    a2/(a1+a2))^2.
-    """
+    """`lubrication_resistance(scale, h, shift, k)`, scale = 6 pi eta (a1 a2 / (a1 + a2))^2."""
     real = precision(name).real
-    one, half = real(1.0), real(0.5)
+    one = real(1.0)
 
     @wp.func
-    def lubrication_resistance(
-        scale: real, distance: real, contact: real, shift: real, inverse_mass_dt: real
-    ) -> real:
-        # shift = 1 subtracts 1/a (a = contact/2), shift = 0 keeps the published jump
-        full = scale * (one / (distance - contact) - shift / (half * contact))
-        return full / (one + full * inverse_mass_dt)
+    def lubrication_resistance(scale: real, gap: real, shift: real, inverse_mass_dt: real) -> real:
+        # c = scale (1/h - shift), shift = 1/a or 0; c / (1 + c k) with one division
+        share = scale * (one - shift * gap)
+        return share / (gap + share * inverse_mass_dt)
 
     return lubrication_resistance

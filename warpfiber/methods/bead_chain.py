@@ -79,6 +79,7 @@ class BeadChain:
         self.set_gradient()
         self._allocate_pair_results()
         self.executor: Executor | None = None
+        self._status_view: np.ndarray | None = None
 
     def _choose_workers(self, workers: int | None) -> int:
         if not self.model.device.startswith("cpu"):
@@ -264,15 +265,22 @@ class BeadChain:
             self.prepare()
             assert self.executor is not None
             self.executor.run(target - self.step_count, self._halted)
-            if self.state.status.numpy()[TORN]:
+            status = self._status()
+            if status[TORN]:
                 return False
-            if self.state.status.numpy()[EXPIRED]:
+            if status[EXPIRED]:
                 self.refresh_list()
         return True
 
     def _halted(self) -> bool:
-        status = self.state.status.numpy()
+        status = self._status()
         return bool(status[EXPIRED] or status[TORN])
+
+    def _status(self) -> np.ndarray:
+        """The status words: on the CPU a view that is made once, looked at after every graph."""
+        if self._status_view is None or not self.model.device.startswith("cpu"):
+            self._status_view = self.state.status.numpy()
+        return self._status_view
 
     @property
     def step_count(self) -> int:

@@ -194,12 +194,13 @@ def _abscissa(table: Mapping[str, NDArray[Any]], column: str) -> tuple[str, NDAr
 
 
 def _references(run: _Run) -> dict[str, Table]:
-    """Tables of `reference/*.csv` beside the scene file, by file name; empty if it is not found."""
+    """Tables `reference/<scene name>*.csv` beside the scene file, by file name; may be empty."""
     named = run.scene.get("path") or run.folder.read_summary().get("scene_path")
     found: dict[str, Table] = {}
     if not named:
         return found
-    for path in sorted((Path(str(named)).parent / "reference").glob("*.csv")):
+    scene = Path(str(named))
+    for path in sorted((scene.parent / "reference").glob(f"{scene.stem}*.csv")):
         with record_errors(path, "read"):
             lines = path.read_text(encoding="utf-8").splitlines()
         rows = list(csv.reader(line for line in lines if line.strip() and line[0] != "#"))

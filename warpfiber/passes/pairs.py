@@ -88,11 +88,11 @@ def make_pair_geometry(name: str, features: PairFeatures):
     closest_fractions = make_segment_distance(name)
     _, unpack_image = make_image(name)
     lubrication_resistance = make_lubrication(name)
-    zero, one = real(0.0), real(1.0)
+    zero, one, two = real(0.0), real(1.0), real(2.0)
     periodic = features.periodic
     inner, outer = real(INNER), real(OUTER)
     near = real(END_TOLERANCE[name])
-    shift = real(1.0 if features.lubrication == "shifted" else 0.0)
+    is_shifted = features.lubrication == "shifted"
 
     @wp.func
     def image_shift(code: wp.int32, lattice: mat33) -> vec3:
@@ -129,10 +129,6 @@ def make_pair_geometry(name: str, features: PairFeatures):
         return True
 
     @wp.func
-    def bead_fraction(k: wp.int32, inner_beads: wp.int32) -> real:
-        return real(k) / real(inner_beads + 1)
-
-    @wp.func
     def bead_count(g: Group, at: wp.int32) -> wp.int32:
         """Beads owned by the segment `at` of its fiber."""
         count = g.inner_beads + 1
@@ -161,44 +157,47 @@ def make_pair_geometry(name: str, features: PairFeatures):
         arm_j = vec3(zero, zero, zero)
         active = wp.int32(0)
         contact = gi.radius + gj.radius
-        reach = outer * contact
-        nearest = inner * contact
+        reach2 = (outer * contact) * (outer * contact)
+        nearest2 = (inner * contact) * (inner * contact)
         narrow = gi.radius * gj.radius / contact
         scale = (gi.drag / gi.radius) * narrow * narrow
+        shift = zero
+        if wp.static(is_shifted):
+            shift = two / contact
         inverse_mass_dt = dt * (one / gi.mass + one / gj.mass)
         count_i = bead_count(gi, at_i)
         count_j = bead_count(gj, at_j)
+        per_bead_j = real(gj.inner_beads + 1)
+        step_i = one / real(gi.inner_beads + 1)
+        step_j = one / per_bead_j
         bb = wp.dot(b, b)
+        inverse_bb = one / bb
+        span = outer * contact / wp.sqrt(bb) * per_bead_j
         for m in range(count_i):
-            s = bead_fraction(m, gi.inner_beads)
+            s = real(m) * step_i
             weight_i = one
             if m > 0 and m <= gi.inner_beads:
                 weight_i = gi.bead_weight
             c0 = delta - s * a
             # beads of j within reach of this bead lie around its foot on the line of j
-            foot = -wp.dot(c0, b) / bb
-            off_line = wp.length_sq(c0 + foot * b)
-            if off_line > reach * reach:
+            foot = -wp.dot(c0, b) * inverse_bb
+            if wp.length_sq(c0 + foot * b) > reach2:
                 continue
-            span = wp.sqrt((reach * reach - off_line) / bb)
-            per_bead = real(gj.inner_beads + 1)
-            n_first = wp.max(wp.int32(wp.ceil((foot - span) * per_bead)), 0)
-            n_last = wp.min(wp.int32(wp.floor((foot + span) * per_bead)), count_j - 1)
+            n_first = wp.max(wp.int32(wp.ceil(foot * per_bead_j - span)), 0)
+            n_last = wp.min(wp.int32(wp.floor(foot * per_bead_j + span)), count_j - 1)
             for n in range(n_first, n_last + 1):
-                t = bead_fraction(n, gj.inner_beads)
+                t = real(n) * step_j
+                c = c0 + t * b
+                cc = wp.length_sq(c)
+                if cc < nearest2 or cc > reach2:
+                    continue
                 weight = weight_i
                 if n > 0 and n <= gj.inner_beads:
                     weight *= gj.bead_weight
-                c = c0 + t * b
-                distance = wp.length(c)
-                if distance < nearest or distance > reach:
-                    continue
-                direction = c / distance
                 velocity = (one - t) * vj0 + t * vj1 - (one - s) * vi0 - s * vi1
-                resistance = lubrication_resistance(
-                    scale, distance, contact, shift, inverse_mass_dt
-                )
-                f = (weight * resistance * wp.dot(velocity, direction)) * direction
+                gap = wp.sqrt(cc) - contact
+                resistance = lubrication_resistance(scale, gap, shift, inverse_mass_dt)
+                f = (weight * resistance * wp.dot(velocity, c) / cc) * c
                 force += f
                 arm_i += s * f
                 arm_j += t * f

@@ -1,0 +1,323 @@
+"""Benchmarks: time and error side by side, as JSON lines in tools/results/bench.jsonl.
+
+    python tools/bench.py engine                  a dense cell: ns per segment-step of every pass
+    python tools/bench.py accuracy                one flexible fiber: run time against error
+    python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
+    python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds
+    options: --seeds N, --strain S, --device D, --workers W, --repeats N, --dry (print, do not
+    write)
+
+A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
+compare only within one run of this tool.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warpfiber as wf
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENES = ROOT / "scenes" / "sasayama_2018"
+RESULTS = ROOT / "tools" / "results" / "bench.jsonl"
+
+# Single flexible fiber of Fig. 5: float64 restatement by RK4 (tests/reference), z/L of the last
+# node.
+FLEXIBLE_TIP = {20: -0.015848495, 30: -0.038916905, 35: -0.122312314, 40: -0.142961750}
+# Scene -> segments of the reduced chain; every cell also runs as the full chain.
+CELLS = {
+    "rigid_rf10_vf122": 3,
+    "rigid_rf10_vf201": 3,
+    "shear_cell": 3,
+    "flexible_rf20_vf056": 7,
+    "flexible_rf30_vf037": 10,
+}
+
+
+def commit() -> str:
+    """Short hash of the tree, with + if it has changes."""
+    run = ["git", "-C", str(ROOT)]
+    try:
+        head = subprocess.run(
+            [*run, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        dirty = subprocess.run([*run, "diff", "--quiet", "HEAD"], check=False).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + ("+" if dirty else "")
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor()
+
+
+def common(simulation: wf.Simulation) -> dict[str, Any]:
+    """What identifies a row."""
+    scene = simulation.scene
+    return {
+        "scene": scene.name,
+        "method": scene.numerics.method,
+        "segments": scene.fibers[0].segments,
+        "closure": scene.numerics.closure,
+        "dt": simulation.dt,
+        "dt_over_limit": round(simulation.dt / simulation.limits[0].dt, 4),
+        "precision": scene.numerics.precision,
+        "device": simulation.device,
+        "processor": processor(),
+        "workers": simulation.method.workers,
+        "segment_count": simulation.model.segment_count,
+        "commit": commit(),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def passes(simulation: wf.Simulation, steps: int) -> dict[str, float]:
+    """ns per segment-step of every pass over `steps` steps, list included."""
+    method, count = simulation.method, simulation.model.segment_count
+    times = simulation.pass_times(steps)
+    result = {name: round(value * 1e9 / count, 2) for name, value in times.items()}
+    return (
+        result | {"listed_pairs_per_segment": round(listed(simulation) / count, 3)}
+        if (method.list)
+        else result
+    )
+
+
+def listed(simulation: wf.Simulation) -> int:
+    """Pairs in the neighbor list."""
+    pairs = simulation.method.list
+    return pairs.pair_count if pairs is not None else 0
+
+
+def timed_steps(simulation: wf.Simulation, steps: int) -> tuple[float, float]:
+    """Wall seconds of `steps` steps, and those of the list builds among them."""
+    method = simulation.method
+    before, begin = method.list_seconds, time.perf_counter()
+    simulation.step(steps)
+    return time.perf_counter() - begin, method.list_seconds - before
+
+
+def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Cells of r_f = 50 fibers at V_f = 0.1, segments of 5 diameters, repulsion only."""
+    for precision in ("float64", "float32"):
+        for fibers in args.fibers:
+            edge = (2.0 * np.pi * 5e-6**3 * 50 * fibers / 0.1) ** (1 / 3)
+            scene = wf.load_scene(
+                SCENES / "shear_cell.toml",
+                {
+                    "box.size": [edge] * 3,
+                    "box.boundary": ["periodic"] * 3,
+                    "fibers.0.aspect_ratio": 51,
+                    "fibers.0.count": fibers,
+                    "contact.lubrication": "none",
+                    "numerics.segments": 10,
+                    "numerics.precision": precision,
+                    "numerics.dt_fraction": 0.5,
+                    "record.quantities": ["overlap"],
+                },
+            )
+            simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+            simulation.step(200)
+            count = simulation.model.segment_count
+            whole, lists = [], []
+            for _ in range(args.repeats):
+                seconds, building = timed_steps(simulation, 100)
+                whole.append(seconds / 100 / count * 1e9)
+                lists.append(building / 100 / count * 1e9)
+            overlap = simulation.measure()["overlap_max"]
+            yield common(simulation) | {
+                "bench": "engine",
+                "ns_per_segment_step": round(float(np.median(whole)), 1),
+                "ns_list": round(float(np.median(lists)), 1),
+                "ns_by_pass": passes(simulation, 50),
+                "error": overlap,
+                "error_kind": "largest overlap, radii",
+            }
+            simulation.close()
+
+
+def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Flexible fiber of Fig. 5: wall time to strain 40 and the worst tip error on the way."""
+    for segments, closure in (
+        (49, "consistent"),
+        (25, "consistent"),
+        (25, "paper"),
+        (15, "consistent"),
+        (15, "paper"),
+        (7, "consistent"),
+    ):
+        for fraction in (0.8, 0.4, 0.1, 0.025):
+            scene = wf.load_scene(
+                SCENES / "flexible.toml",
+                {
+                    "numerics.segments": segments,
+                    "numerics.closure": closure,
+                    "numerics.dt_fraction": fraction,
+                },
+            )
+            simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+            simulation.step(1)
+            length = scene.fibers[0].centerline_length
+            worst, seconds = 0.0, 0.0
+            for strain, tip in FLEXIBLE_TIP.items():
+                begin = time.perf_counter()
+                simulation.run(until=float(strain))
+                seconds += time.perf_counter() - begin
+                nodes = simulation.node_pos
+                here = (nodes[-1] - nodes.mean(axis=0))[2] / length
+                worst = max(worst, abs(here - tip))
+            steps = simulation.step_count
+            yield common(simulation) | {
+                "bench": "accuracy",
+                "seconds": round(seconds, 4),
+                "steps": steps,
+                "ns_per_segment_step": round(seconds / steps / segments * 1e9, 1),
+                "error": worst,
+                "error_kind": "tip z/L at strain 20, 30, 35, 40 against the full chain by RK4",
+            }
+            simulation.close()
+
+
+def period(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Fig. 3: 2 t_1 of a rigid fiber, corrected and not, against the full chain."""
+    full: float | None = None
+    for closure in ("paper", "consistent", "none"):
+        for segments in (99, 33, 11, 9, 3, 1) if closure == "paper" else (33, 11, 9, 3, 1):
+            scene = wf.load_scene(
+                SCENES / "period.toml",
+                {"numerics.segments": segments, "numerics.closure": closure},
+            )
+            simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+            simulation.step(1)
+            begin = time.perf_counter()
+            value = 2.0 * half_turn(simulation) / scene.flow.rate
+            seconds = time.perf_counter() - begin
+            full = value if full is None else full
+            steps = simulation.step_count
+            yield common(simulation) | {
+                "bench": "period",
+                "period": value,
+                "seconds": round(seconds, 2),
+                "steps": steps,
+                "ns_per_segment_step": round(seconds / steps / segments * 1e9, 1),
+                "error": value / full - 1.0,
+                "error_kind": "relative to the full chain (99 segments)",
+            }
+            simulation.close()
+
+
+def half_turn(simulation: wf.Simulation, limit: float = 1000.0, every: float = 0.2) -> float:
+    """Strain at which the end-to-end vector of fiber 0 passes -x, by cubic interpolation."""
+    strains, angles = [0.0], [0.0]
+    last = simulation.fiber_node_start[1] - 1
+    while strains[-1] < limit:
+        simulation.run(until=simulation.strain + every)
+        nodes = simulation.node_pos
+        axis = nodes[last] - nodes[0]
+        angle = np.arctan2(axis[2], axis[0])
+        step = (angle - angles[-1] + np.pi) % (2.0 * np.pi) - np.pi
+        strains.append(simulation.strain)
+        angles.append(angles[-1] + step)
+        if len(angles) > 4 and angles[-3] < -np.pi:
+            # inverse interpolation through the four samples around the passage
+            x, y = np.array(angles[-5:-1]) + np.pi, np.array(strains[-5:-1])
+            return float(np.polyval(np.polyfit(x, y - y[0], 3), 0.0) + y[0])
+    raise RuntimeError("the fiber did not turn")
+
+
+def suspensions(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Cells of Figs. 6-9: A and interactions over the second half of the strain, per seed."""
+    for name in args.names or CELLS:
+        for seed in range(1, args.seeds + 1):
+            for segments in args.segments or (CELLS[name], 0):
+                key = "segments" if segments else "reduced_beads"
+                overrides = {"seed": seed, f"numerics.{key}": segments} | dict(args.set)
+                scene = wf.load_scene(SCENES / f"{name}.toml", overrides)
+                yield suspension(scene, args)
+
+
+def suspension(scene: wf.Scene, args: argparse.Namespace) -> dict[str, Any]:
+    """One run: means over the second half of the strain."""
+    simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+    simulation.method.prepare()
+    begin = time.perf_counter()
+    rows: list[dict[str, float]] = []
+    for strain in np.linspace(0.0, args.strain, 301):
+        simulation.run(until=float(strain))
+        rows.append(simulation.measure())
+    seconds = time.perf_counter() - begin
+    late = rows[len(rows) // 2 :]
+    mean = {k: float(np.mean([row[k] for row in late])) for k in late[0] if k != "step"}
+    steps = simulation.step_count
+    simulation.close()
+    return common(simulation) | {
+        "bench": "suspension",
+        "seed": scene.seed,
+        "strain": args.strain,
+        "lubrication_step": scene.numerics.lubrication_step,
+        "lubrication": scene.contact.lubrication,
+        "seconds": round(seconds, 1),
+        "steps": steps,
+        "ns_per_segment_step": round(seconds / steps / simulation.model.segment_count * 1e9, 1),
+        "a11": round(mean["a11"], 5),
+        "a22": round(mean["a22"], 5),
+        "a33": round(mean["a33"], 5),
+        "a11_end": round(rows[-1]["a11"], 5),
+        "interactions_per_fiber": round(mean["interactions_per_fiber"], 4),
+        "contacts_per_fiber": round(mean["contacts_per_fiber"], 4),
+        "overlap_max": round(max(row["overlap_max"] for row in rows), 4),
+        "curve_strain": [round(row["strain"], 2) for row in rows[::10]],
+        "curve_a11": [round(row["a11"], 4) for row in rows[::10]],
+        "error": max(row["axial_strain_max"] for row in rows),
+        "error_kind": "largest axial strain",
+    }
+
+
+def main() -> None:
+    """Run one benchmark and append its rows."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("bench", choices=["engine", "accuracy", "period", "suspensions"])
+    parser.add_argument("names", nargs="*", help="cells of `suspensions`")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--strain", type=float, default=60.0)
+    parser.add_argument("--segments", type=int, nargs="*", help="0 = full chain")
+    parser.add_argument("--fibers", type=int, nargs="*", default=[50, 2000])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--set", action="append", default=[], type=_override)
+    parser.add_argument("--dry", action="store_true", help="print only")
+    args = parser.parse_args()
+    for row in globals()[args.bench](args):
+        line = json.dumps(row)
+        print(line, flush=True)
+        if not args.dry:
+            RESULTS.parent.mkdir(exist_ok=True)
+            with RESULTS.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+
+
+def _override(text: str) -> tuple[str, object]:
+    from warpfiber.scene import parse_override
+
+    return parse_override(text)
+
+
+if __name__ == "__main__":
+    main()
