@@ -136,6 +136,16 @@ def bent_fiber(
     return nodes - nodes.mean(axis=0) + np.asarray(center)
 
 
+def fiber_between(
+    kind: Kind, rng: np.random.Generator, low: Sequence[float], high: Sequence[float]
+) -> Array:
+    """Bent fiber with its mean between `low` and `high`, and all of it between them along z."""
+    while True:
+        nodes = bent_fiber(kind, rng, np.asarray(low) + np.subtract(high, low) * rng.random(3))
+        if nodes[:, 2].min() > low[2] and nodes[:, 2].max() < high[2]:
+            return nodes
+
+
 def straight_fiber(kind: Kind, direction: Sequence[float], center: Sequence[float]) -> Array:
     """Unloaded straight fiber; (n, 3)."""
     axis = np.asarray(direction, float) / np.linalg.norm(direction)

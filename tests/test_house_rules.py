@@ -25,7 +25,7 @@ ROOMS = (
     {"placement", "passes"},
     {"build", "methods", "output"},
     {"simulation"},
-    {"summary", "stopping"},
+    {"summary", "stopping", "restart"},
     {"job", "checking", "progress"},
     {"__main__"},
 )

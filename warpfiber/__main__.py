@@ -205,6 +205,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RecordError as fault:
         print(f"warpfiber: {fault}", file=sys.stderr)
         return 4
+    except OSError as fault:  # a full disk, a folder taken away
+        print(f"warpfiber: {fault}", file=sys.stderr)
+        return 4
     except ImportError as missing:
         if missing.name not in ("matplotlib", "tqdm", "pxr"):
             raise

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
 from warpfiber.methods.bead_chain import LIST_SKIN, contact_reach
+from warpfiber.methods.box_limits import strain_limit
 from warpfiber.methods.stability import chosen_step, step_limits
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
@@ -11,6 +16,7 @@ from warpfiber.scene.derived import (
     effective_stiffness,
     equivalent_aspect_ratio,
     jeffery_period,
+    longest_segment,
     node_count,
     reynolds_number,
     segment_count,
@@ -44,6 +50,20 @@ def record_bytes(scene: Scene) -> float:
     nodes = sum(node_count(group) for group in scene.fibers)
     fibers = sum(group.count for group in scene.fibers)
     return frames * 12.0 * (nodes * (1 + len(scene.record.node_fields)) + fibers)
+
+
+def box_strain_limit(scene: Scene) -> float:
+    """Strain that a periodic box in a flow other than simple shear along its axes can bear."""
+    box, flow = scene.box, scene.flow
+    if box is None or flow is None or flow.rate == 0.0 or flow.velocity_gradient is None:
+        return math.inf
+    gradient = np.asarray(flow.velocity_gradient)
+    if any(kind != "periodic" for kind in box.boundary) or np.count_nonzero(gradient) == 1:
+        return math.inf
+    diameter = max(group.diameter for group in scene.fibers)
+    skin = LIST_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
+    width = 1.071 * longest_segment(scene) + contact_reach(scene) * diameter + skin
+    return strain_limit(np.asarray(box.size), gradient, flow.rate, width)
 
 
 def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str, str]]:
@@ -94,6 +114,9 @@ def check_lines(scene: Scene) -> list[str]:
         skin = scene.numerics.skin
         text = f"auto, {LIST_SKIN} diameters" if skin is None else f"{skin:.3g} m"
         rows.append(("neighbor list skin", text))
+        limit_strain = box_strain_limit(scene)
+        if math.isfinite(limit_strain):
+            rows.append(("strain at which the box is too flat", _number(limit_strain)))
     rows.append(("memory of the arrays", f"{memory_bytes(scene) / 1e6:.3g} MB"))
     if scene.record.trajectory:
         rows.append(("size of the record", f"{record_bytes(scene) / 1e6:.3g} MB"))

@@ -8,6 +8,7 @@ last good state and, beside it, the bad one.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from pathlib import Path
@@ -15,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from warpfiber.output.checkpoint import latest_checkpoint, read_checkpoint, write_checkpoint
-from warpfiber.output.folder import RecordError, ResultFolder
+from warpfiber.output.checkpoint import write_checkpoint
+from warpfiber.output.folder import ResultFolder
 from warpfiber.output.scalars import ScalarsWriter
 from warpfiber.output.trajectory import TrajectoryWriter
-from warpfiber.scene import Scene, Stage, scene_from_dict
-from warpfiber.simulation import Diverged, Simulation
+from warpfiber.restart import read_restart
+from warpfiber.scene import Scene, SceneError, Stage
+from warpfiber.simulation import BoxExhausted, Diverged, Simulation
 from warpfiber.stopping import Stopper
 from warpfiber.summary import Summary, versions
 
@@ -42,6 +44,7 @@ class Job:
         self.stage_start = (0.0, 0.0)  # strain and time where the stage began
         self.row_index = 0
         self.frame_index = 0
+        self.fresh = True  # the row and the frame of the start are still to be written
         self.last_row: dict[str, float] = {}
         self.good: dict[str, np.ndarray] = {}
         self.good_attrs: dict[str, Any] = {}
@@ -93,35 +96,40 @@ class Job:
         workers: int | None = None,
         progress: Any = None,
     ) -> Job:
-        """Continue from the latest checkpoint of a folder. Raises SceneError, RecordError."""
+        """Continue from the latest whole checkpoint of a folder. Raises SceneError, RecordError."""
         folder = ResultFolder.open(path)
-        checkpoint = latest_checkpoint(folder.path)
-        if checkpoint is None:
-            raise RecordError(f"{folder.path}: no checkpoint to resume from")
-        arrays, attrs = read_checkpoint(checkpoint)
-        scene = scene_from_dict(json.loads(attrs["scene"]))
+        restart = read_restart(folder)
+        attrs = restart.attrs
         simulation = Simulation(
-            scene, device=device or attrs["device"], workers=workers, placement=_placement(arrays)
+            restart.scene,
+            device=device or attrs["device"],
+            workers=workers,
+            placement=restart.placement,
         )
-        simulation.restore(arrays)
+        simulation.restore(restart.arrays)
         job = cls(simulation, folder, progress=progress)
+        job.scene = dataclasses.replace(simulation.scene, fibers=restart.fibers)
+        job.fresh = False
+        job.last_row = dict(attrs["last_row"])
+        job.summary.restore(job.last_row, attrs["half_turns"])
         job.stage_index = int(attrs["stage_index"])
         job.stage_start = (float(attrs["stage_strain"]), float(attrs["stage_time"]))
         job.row_index, job.frame_index = int(attrs["row_index"]), int(attrs["frame_index"])
         job.summary.wall_before = float(attrs["wall_seconds"])
         step = simulation.step_count
         job.scalars = ScalarsWriter.reopen(folder.scalars_path, step)
-        if scene.record.trajectory:
+        if job.scene.record.trajectory:
             job.trajectory = TrajectoryWriter.reopen(folder.trajectory_path, step)
-        folder.log(f"resumed at step {step} from {checkpoint.name}")
+        folder.log(f"resumed at step {step} from {restart.path.name}")
         return job
 
     def describe(self) -> str:
         """One line: counts, dt and what limits it."""
         model, limit = self.simulation.model, self.simulation.limits[0]
+        warning = "unstable: above its " if self.simulation.dt > limit.dt else ""
         return (
             f"{model.fiber_count} fibers, {model.segment_count} segments, "
-            f"dt {self.simulation.dt:.4g} s (limit {limit.dt:.4g} s, {limit.term}), "
+            f"dt {self.simulation.dt:.4g} s ({warning}limit {limit.dt:.4g} s, {limit.term}), "
             f"{self.scene.numerics.precision} on {self.simulation.device}, "
             f"workers {self.simulation.method.workers}"
         )
@@ -130,6 +138,10 @@ class Job:
 
     def run(self, *, max_wall: float | None = None) -> int:
         """Run to the end of the last stage; returns the exit code (0, 3, 130 or 143)."""
+        if self.stage_index >= len(self.stages):
+            self._close()
+            self.folder.log("nothing left to do")
+            return 0
         code = 0
         with Stopper(max_wall) as stopper:
             try:
@@ -146,11 +158,14 @@ class Job:
                     code = stopper.exit_code
             except Diverged as torn:
                 code = self._diverged(torn)
+            except (BoxExhausted, SceneError) as limit:  # the box, or a segment that outgrew it
+                code = self._exhausted(limit)
             else:
                 self._write_checkpoint(self.simulation.snapshot(), self._position())
             finally:
                 self._close()
-        outcome = {0: "finished", 3: "diverged", 130: "interrupted", 143: "stopped"}[code]
+        failed = (self.summary.failure or {}).get("outcome", "diverged")
+        outcome = {0: "finished", 3: failed, 130: "interrupted", 143: "stopped"}[code]
         self.folder.write_summary(self.summary.as_dict(self, outcome))
         self.folder.log(f"{outcome} at step {self.simulation.step_count}")
         return code
@@ -163,6 +178,7 @@ class Job:
             steps = min(self._steps_to_events(stage))
             if steps <= 0:
                 break
+            self._checkpoint_if_due()  # here all that is due has been recorded
             begin = time.perf_counter()
             before = simulation.step_count
             simulation.step(min(steps, self.summary.steps_within(LOOK_EVERY)))
@@ -170,7 +186,6 @@ class Job:
             self._show_progress()
             if self._past_time_limit(stage):
                 return 3
-            self._checkpoint_if_due()
         if stopper.reason:
             return 0
         self._record_due()
@@ -181,14 +196,16 @@ class Job:
     def _steps_to_events(self, stage: Stage) -> list[int]:
         row = self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
         frame = self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
-        return [
-            self._stage_steps(stage),
-            self.simulation.steps_to(*row),
-            self.simulation.steps_to(*frame),
-        ]
+        steps_to = self.simulation.steps_to
+        return [self._stage_steps(stage), steps_to(*row), steps_to(*frame)]
+
+    def _end_strain(self, stage: Stage) -> float | None:
+        flow = self.scene.flow  # a fluid at rest never reaches a strain
+        return stage.end_strain if flow is not None and flow.rate > 0.0 else None
 
     def _stage_steps(self, stage: Stage) -> int:
-        strain = None if stage.end_strain is None else self.stage_start[0] + stage.end_strain
+        end = self._end_strain(stage)
+        strain = None if end is None else self.stage_start[0] + end
         moment = None if stage.end_time is None else self.stage_start[1] + stage.end_time
         return self.simulation.steps_to(strain, moment)
 
@@ -213,8 +230,8 @@ class Job:
 
     def _share(self, stage: Stage, count: int) -> tuple[str, float]:
         """`count` even parts of the whole run, in strain where the stages end by strain."""
-        ends = [s.end_strain for s in self.stages]
-        if stage.end_strain is not None:
+        ends = [self._end_strain(s) for s in self.stages]
+        if self._end_strain(stage) is not None:
             return "strain", sum(e for e in ends if e is not None) / count
         times = [s.end_time for s in self.stages]
         return "time", sum(t for t in times if t is not None) / count
@@ -231,7 +248,9 @@ class Job:
         limit = stage.time_limit
         if limit is None or self.simulation.time - self.stage_start[1] < limit:
             return False
-        self.folder.log(f"stage '{stage.name}': end condition not met within {limit} s")
+        message = f"stage '{stage.name}': end condition not met within {limit:g} s"
+        self.folder.log(message)
+        self.summary.failure = {"outcome": "end condition not met", "message": message}
         return True
 
     # -- recording --------------------------------------------------------------------------------
@@ -243,27 +262,34 @@ class Job:
             return
         stage = self.stages[self.stage_index]
         begin = time.perf_counter()
-        first = simulation.step_count == 0 and self.stage_index == 0
-        row_due = simulation.steps_to(
-            *self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
-        )
-        frame_due = simulation.steps_to(
-            *self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
-        )
-        if first or row_due <= 0:
+        first, self.fresh = self.fresh, False
+        row_index = self._reached(stage, self.row_index, self._row_interval(stage))
+        frame_index = self._reached(stage, self.frame_index, self._frame_interval(stage))
+        row_due = first or row_index > self.row_index
+        if row_due:
             row = simulation.measure()
             self.scalars.append(row)
             self.last_row = row
             self.summary.look_at(row)
-            self.row_index += 0 if first else 1
-        if first or frame_due <= 0:
+            self.row_index = row_index
+        if first or frame_index > self.frame_index:
             self._write_frame()
-            self.frame_index += 0 if first else 1
+            self.frame_index = frame_index
             if not first:
                 self._profile(stage)
         self.summary.recording_seconds += time.perf_counter() - begin
-        if first or row_due <= 0:
+        if row_due:
             self._keep_good()
+
+    def _reached(self, stage: Stage, index: int, interval: tuple[str, float]) -> int:
+        """Index of the last mark reached: one step may pass several of them."""
+        kind, width = interval
+        value = self.simulation.strain if kind == "strain" else self.simulation.time
+        start = self.stage_start[0 if kind == "strain" else 1]
+        index = max(index, int((value - start) / width))
+        while self.simulation.steps_to(*self._event_mark(stage, index + 1, interval)) <= 0:
+            index += 1
+        return index
 
     def _write_frame(self) -> None:
         if self.trajectory is None:
@@ -315,6 +341,8 @@ class Job:
             "row_index": self.row_index,
             "frame_index": self.frame_index,
             "wall_seconds": self.summary.wall_seconds,
+            "last_row": self.last_row,
+            "half_turns": list(self.summary.half_turns),
         }
 
     def _keep_good(self) -> None:
@@ -326,12 +354,8 @@ class Job:
     def _write_checkpoint(self, arrays: dict[str, np.ndarray], position: dict[str, Any]) -> Path:
         start, group = self.simulation.fiber_node_start, self.simulation.model.host["fiber_group"]
         attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
-        length = self.simulation.model.units.length
-        layout: dict[str, np.ndarray] = {
-            "fiber_node_start": start,
-            "fiber_group": group,
-            "length": np.asarray(length),
-        }
+        length = np.asarray(self.simulation.model.units.length)
+        layout = {"fiber_node_start": start, "fiber_group": group, "length": length}
         self.summary.checkpoint_time = time.perf_counter()
         step = int(arrays["step"][0])
         return write_checkpoint(self.folder.path, step, arrays | layout, attrs)
@@ -353,6 +377,14 @@ class Job:
         self.summary.failure = torn.report
         return 3
 
+    def _exhausted(self, limit: BoxExhausted | SceneError) -> int:
+        """A run that met a limit of its scene: its state is good and is kept."""
+        path = self._write_checkpoint(self.simulation.snapshot(), self._position())
+        message = f"{limit}; state: {path}"
+        self.summary.failure = {"outcome": "limit reached", "message": message}
+        self.folder.log(str(limit))
+        return 3
+
     def _close(self) -> None:
         self.scalars.close()
         if self.trajectory is not None:
@@ -360,15 +392,3 @@ class Job:
         self.simulation.close()
         if self.progress is not None:
             self.progress.close()
-
-
-def _placement(arrays: dict[str, np.ndarray]) -> Any:
-    """The layout of a checkpoint as a placement; positions are overwritten by the restore."""
-    from warpfiber.placement import Placement
-
-    return Placement(
-        node_pos=arrays["node_pos"].astype(float) * float(arrays["length"]),
-        fiber_node_start=arrays["fiber_node_start"],
-        fiber_group=arrays["fiber_group"],
-        report={},
-    )

@@ -7,14 +7,43 @@ eta * rate * radius^2 for force, so that float32 neither under- nor overflows.
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-# Warp announces itself and every module it loads; a user of warpfiber did not ask for that.
-wp.config.log_level = wp.LOG_WARNING
+
+def _start_warp() -> None:
+    """Initialize Warp without its announcements.
+
+    Its native part writes a warning to the error stream on every machine without a CUDA driver;
+    that one line is held back, everything else is passed on.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as caught:
+        try:
+            kept = os.dup(2)
+        except OSError:  # no error stream to keep clean
+            wp.init()
+            return
+        os.dup2(caught.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        caught.seek(0)
+        for line in caught.read().decode(errors="replace").splitlines():
+            if "NVIDIA CUDA driver" not in line:
+                print(line, file=sys.stderr)
+
+
+_start_warp()
 
 
 @dataclass(frozen=True)
@@ -41,10 +70,11 @@ def precision(name: str) -> Precision:
     return _PRECISIONS[name]
 
 
-# Slots of State.status. A sweep sets EXPIRED (the neighbor list) or TORN (a diverged fiber); the
-# next step then only sets HALT and changes nothing until the host has looked, so any number of
-# steps may be queued. OVERFLOW bits say which list capacity is too small.
-EXPIRED, TORN, HALT, BAD_FIBER, OVERFLOW, PAIR_COUNT, ROW_NEED = range(7)
+# Slots of State.status. A sweep sets EXPIRED (the neighbor list), STRETCHED (a segment outgrew the
+# cells of the list) or TORN (a diverged fiber); the next step then only sets HALT and changes
+# nothing until the host has looked, so any number of steps may be queued. OVERFLOW bits say which
+# capacity of the list is too small.
+EXPIRED, TORN, STRETCHED, HALT, BAD_FIBER, OVERFLOW, PAIR_COUNT, ROW_NEED = range(8)
 STATUS_SIZE = 8
 OVERFLOW_ROW, OVERFLOW_PAIRS = 1, 2
 

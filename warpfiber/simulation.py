@@ -36,6 +36,10 @@ class Diverged(Exception):
         super().__init__(report["message"])
 
 
+class BoxExhausted(Exception):
+    """The flow has deformed a periodic box until a segment and its reach no longer fit into it."""
+
+
 def choose_device(scene: Scene, segments: int) -> str:
     """Device of the run; raises SceneError if the one asked for does not exist."""
     wanted = scene.numerics.device
@@ -109,14 +113,23 @@ class Simulation:
     # -- stepping ---------------------------------------------------------------------------------
 
     def step(self, count: int = 1) -> None:
-        """Advance `count` steps of dt; raises Diverged if a fiber tears."""
-        if not self.method.advance(count):
+        """Advance `count` steps of dt; raises Diverged if a fiber tears, BoxExhausted."""
+        end = self.method.strain_end
+        allowed = count if math.isinf(end) else min(count, self.steps_to(end, None))
+        if not self.method.advance(allowed):
             raise Diverged(self._torn_report())
+        if allowed < count:
+            height = self.method.box_width * self.model.units.length
+            raise BoxExhausted(
+                f"stopped at strain {self.strain:.6g}: the flow has deformed the periodic box "
+                f"until its smallest height is {height:.4g} m "
+                "(longest segment + reach + skin); take a larger box or more segments"
+            )
 
     def run(self, until: float | None = None, *, time: float | None = None) -> None:
         """Advance to the strain `until`, or to `time` in s; default: the end of the last stage.
 
-        The end is reached to within one step. Raises Diverged if a fiber tears.
+        The end is reached to within one step. Raises Diverged if a fiber tears, BoxExhausted.
         """
         if until is None and time is None:
             until, time = self._scene_end()
@@ -203,12 +216,13 @@ class Simulation:
         image = np.asarray(self.state.fiber_image.numpy(), dtype=float)
         shift = image @ np.asarray(self.state.lattice.numpy()[0]).T
         nodes = np.asarray(self.state.node_pos.numpy(), dtype=float)
-        return nodes + np.repeat(shift, counts, axis=0)
+        unwrapped: np.ndarray = nodes + np.repeat(shift, counts, axis=0)
+        return unwrapped
 
     def measure(self) -> dict[str, float]:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
         self.method.prepare()
-        row = {"step": float(self.step_count), "time": self.time, "strain": self.strain}
+        row = {"step": self.step_count, "time": self.time, "strain": self.strain}
         return row | self.measurement.row(self.method.list)
 
     # -- saving -----------------------------------------------------------------------------------
@@ -224,6 +238,7 @@ class Simulation:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from a snapshot exactly as the run that took it would have."""
         state = self.state
+        state.status.fill_(0)
         for name in _ARRAYS:
             getattr(state, name).assign(arrays[name])
         if self.method.list is not None:
@@ -233,7 +248,6 @@ class Simulation:
             self.method.refresh_list(wrap=False)
             for name in ("node_pos", "lattice", "deformation"):
                 getattr(state, name).assign(arrays[name])
-        state.status.fill_(0)
         self.method.set_gradient()
         if self.measurement.angle is not None:
             self.measurement.angle = np.asarray(arrays["angle"])

@@ -7,6 +7,7 @@ import time
 from importlib import metadata
 from typing import Any
 
+from warpfiber import __version__
 from warpfiber.simulation import Simulation
 
 
@@ -18,7 +19,7 @@ def versions() -> dict[str, str]:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+            found[name] = __version__ if name == "warpfiber" else "not installed"
     return found | {"python": platform.python_version()}
 
 
@@ -59,6 +60,10 @@ class Summary:
     def wall_seconds(self) -> float:
         """Wall time of the run so far, earlier parts of a resumed run included."""
         return self.wall_before + time.perf_counter() - self.started
+
+    def restore(self, last_row: dict[str, float], half_turns: list[float]) -> None:
+        """Go on looking for half turns where the stopped run left off."""
+        self._last, self.half_turns = last_row, list(half_turns)
 
     def look_at(self, row: dict[str, float]) -> None:
         """Find the strains at which the mean end-to-end angle passes -k pi (half turns)."""

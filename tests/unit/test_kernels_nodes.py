@@ -188,3 +188,26 @@ def test_folded_and_straight_joints(start: Start, closure: str) -> None:
     expected = bc.acceleration(kind.chain(closure), nodes, 0.0 * nodes, np.zeros((3, 3)))
     # near pi the couple is k_b theta/(l sin theta) times a vector of size sin(theta), known to eps
     assert np.abs(sim.node_velocity - before - expected).max() < 1e-11 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("segments", [1, 2, 4])
+def test_node_on_the_center(start: Start, segments: int) -> None:
+    """Straight fiber, closure `paper`: the middle node lies on G, its factors are the limits.
+
+    Axis and lengths are exact in binary, so the reference meets the exact zero; 1e-12 relative.
+    """
+    kind = Kind(segments, 2.0)
+    nodes = np.zeros((segments + 1, 3))
+    nodes[:, 0] = 4.0 * (np.arange(segments + 1) - segments / 2.0)
+    velocity = np.random.default_rng(1).normal(size=nodes.shape)
+    sim = start(
+        [kind],
+        [nodes],
+        velocity=velocity,
+        flow=flow_of(GRADIENT),
+        numerics={"closure": "paper", **ONE_STEP},
+    )
+    before = sim.node_velocity
+    sim.step()
+    expected = bc.acceleration(kind.chain("paper"), nodes, velocity, GRADIENT)
+    assert np.abs(sim.node_velocity - before - expected).max() < 1e-12 * np.abs(expected).max()

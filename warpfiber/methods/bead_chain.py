@@ -17,18 +17,20 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
-from warpfiber.model import BAD_FIBER, EXPIRED, TORN, Model, State
+from warpfiber.methods.box_limits import smallest_sheared_height, strain_limit
+from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Executor, Launch
 from warpfiber.passes.measure import TERMS, make_measure_terms
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
-from warpfiber.scene import Scene
+from warpfiber.scene import Fault, Scene, SceneError
 
 # Below this many segments the hand-off between workers costs more than it saves.
 WORKER_BREAK_EVEN = 5000
 LIST_SKIN = 0.3  # diameters
+STRETCH_GROWTH = 1.2  # how much longer segments may be after they outgrew the cells of the list
 
 
 def contact_reach(scene: Scene) -> float:
@@ -63,9 +65,11 @@ class BeadChain:
         )
         self.list: NeighborList | None = None
         self.list_seconds = 0.0
+        self.strain_end = math.inf  # where a deforming box becomes too flat
+        self.set_gradient()
         if self.has_pairs:
             largest = max(row["radius"] for row in model.group_rows)
-            longest = max(row["rest"] for row in model.group_rows) * 1.05
+            longest = max(row["rest"] for row in model.group_rows)
             skin = LIST_SKIN * 2.0 * largest
             if scene.numerics.skin is not None:
                 skin = scene.numerics.skin / units.length
@@ -74,9 +78,10 @@ class BeadChain:
                 state,
                 reach=contact_reach(scene) * 2.0 * largest,
                 skin=skin,
-                longest=longest,
+                longest_rest=longest,
+                stretch=self._largest_stretch(),
             )
-        self.set_gradient()
+            self.check_box()
         self._allocate_pair_results()
         self.executor: Executor | None = None
         self._status_view: np.ndarray | None = None
@@ -89,6 +94,42 @@ class BeadChain:
         if self.model.segment_count < WORKER_BREAK_EVEN:
             return 1
         return min(2, len(os.sched_getaffinity(0)))
+
+    def _largest_stretch(self) -> float:
+        """Longest segment now, in its rest lengths."""
+        model = self.model
+        nodes = self.state.node_pos.numpy().astype(float)
+        first = model.host["segment_node"]
+        rest = np.asarray([row["rest"] for row in model.group_rows])
+        mine = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
+        return float((np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine).max())
+
+    def check_box(self) -> None:
+        """Find the strain the box can bear; raises SceneError if it is too small from the start."""
+        assert self.list is not None
+        domain, width = self.model.domain, self.list.cell_width
+        size = np.asarray(domain.size)
+        smallest = min(
+            (edge for edge, wraps in zip(size, domain.periodic, strict=True) if wraps),
+            default=math.inf,
+        )
+        if domain.shear_axes is not None:
+            smallest = smallest_sheared_height(size, domain.shear_axes)
+        elif domain.sheared:
+            self.strain_end = strain_limit(size, self.full_gradient, self.flow_rate, width)
+        if smallest < width:
+            length = self.model.units.length
+            remedy = (
+                f"a periodic box must be {width * length:.4g} m high everywhere (longest segment + "
+                "reach + skin, shear included); enlarge it or take more segments"
+            )
+            edges = [float(edge) * length for edge in size]
+            raise SceneError([Fault(self.scene.path, "box.size", edges, remedy)])
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have, run units."""
+        return self.list.cell_width if self.list is not None else 0.0
 
     def set_gradient(self) -> None:
         """The flow's gradient at the present strain, before the first step sets it."""
@@ -209,6 +250,7 @@ class BeadChain:
                 p.real(self.decay),
                 p.real(pairs.reach + pairs.skin if pairs else 0.0),
                 p.real(pairs.skin if pairs else 0.0),
+                p.real(pairs.stretch_allowed if pairs else 0.0),
                 model.groups,
                 model.pivots,
                 model.fiber_node_start,
@@ -268,13 +310,17 @@ class BeadChain:
             status = self._status()
             if status[TORN]:
                 return False
-            if status[EXPIRED]:
+            if status[STRETCHED] and self.list is not None:
+                self.list.allow_stretch(STRETCH_GROWTH)
+                self.check_box()
+                self._stop_executor()
+            if status[EXPIRED] or status[STRETCHED]:
                 self.refresh_list()
         return True
 
     def _halted(self) -> bool:
         status = self._status()
-        return bool(status[EXPIRED] or status[TORN])
+        return bool(status[EXPIRED] or status[TORN] or status[STRETCHED])
 
     def _status(self) -> np.ndarray:
         """The status words: on the CPU a view that is made once, looked at after every graph."""

@@ -22,7 +22,7 @@ from warpfiber.scene import Fault, SceneError
 
 __all__ = ["RecordError", "ResultFolder", "describe"]
 
-_FILES = ("scene.json", "log.txt", "scalars.csv", "summary.json", "run.vtkhdf")
+_FILES = ("scene.json", "log.txt", "scalars.csv", "summary.json", "run.vtkhdf", "diverged.npz")
 _FOLDERS = ("figures", "usd")
 
 

@@ -35,6 +35,9 @@ _INK, _GRAY = "#22262b", "#6b7280"
 _BLUE, _ORANGE, _GREEN, _PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
+_DECADES = 1e10
+"""Largest ratio of the ends of a logarithmic axis."""
+
 
 @dataclass(frozen=True)
 class Curves:
@@ -313,6 +316,9 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
     axes.margins(x=0)
     if curves.logarithmic:
         axes.set_yscale("log")
+        # rounding at the start must not squeeze everything else into a corner
+        top = axes.get_ylim()[1]
+        axes.set_ylim(max(axes.get_ylim()[0], top / _DECADES), top)
     elif curves.ylim:
         low, high = curves.ylim
         axes.set_ylim(low, high if np.isfinite(high) else max(1.08 * axes.get_ylim()[1], 1e-12))

@@ -8,15 +8,14 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.model import EXPIRED, HALT, TORN, precision
+from warpfiber.model import EXPIRED, HALT, STRETCHED, TORN, precision
 
 
 @cache
 def make_clock(name: str, sheared: bool, scheduled: bool):
     """Kernel `clock_step` (one thread)."""
     p = precision(name)
-    vec3, mat33 = p.vec3, p.mat33
-    del vec3
+    mat33 = p.mat33
 
     @wp.func
     def rate_factor(strain: wp.float64, schedule: wp.array(dtype=wp.vec2d)) -> wp.float64:
@@ -45,7 +44,8 @@ def make_clock(name: str, sheared: bool, scheduled: bool):
         lattice_now_out: wp.array(dtype=mat33),
         deformation: wp.array(dtype=wp.mat33d),
     ):
-        if status[wp.static(EXPIRED)] != 0 or status[wp.static(TORN)] != 0:
+        stop = status[wp.static(EXPIRED)] + status[wp.static(TORN)] + status[wp.static(STRETCHED)]
+        if stop != 0:
             status[wp.static(HALT)] = 1
             return
         status[wp.static(HALT)] = 0

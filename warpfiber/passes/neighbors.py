@@ -8,7 +8,7 @@ repeated.
 The list is exact for as long as the node sweep's skin test says so (`nodes.skin_limit`): motion is
 measured beside the imposed affine flow, which moves pairs apart by a known amount.
 
-Limits: box edges (heights of a sheared box) >= longest segment + reach + skin.
+Limits: heights of the box >= `cell_width`; the host checks that.
 """
 
 from __future__ import annotations
@@ -46,13 +46,15 @@ class NeighborList:
         *,
         reach: float,
         skin: float,
-        longest: float,
+        longest_rest: float,
+        stretch: float = 1.0,
         row_capacity: int = 24,
         pair_capacity: int | None = None,
     ) -> None:
         self.model, self.state = model, state
         self.reach, self.skin = reach, skin
-        self.cell_width = longest + reach + skin
+        self.longest_rest = longest_rest
+        self.stretch_allowed = max(1.05, 1.02 * stretch)
         self.row_capacity = row_capacity
         self.pair_capacity = pair_capacity or max(64, 4 * model.segment_count)
         self.build_count = 0
@@ -79,6 +81,17 @@ class NeighborList:
         self.segment_total = wp.array([segments], dtype=wp.int32, device=device)
         self._allocate_rows()
         self._allocate_pairs()
+
+    @property
+    def cell_width(self) -> float:
+        """Width that holds a segment, its reach and the skin; a step may stretch a bit more."""
+        return 1.02 * self.stretch_allowed * self.longest_rest + self.reach + self.skin
+
+    def allow_stretch(self, factor: float) -> None:
+        """Widen the cells for longer segments; the next build uses them."""
+        self.stretch_allowed *= factor
+        self._graphs = {}
+        self.state.status.zero_()
 
     def _allocate_rows(self) -> None:
         size, device = self.model.segment_count * self.row_capacity, self.model.device

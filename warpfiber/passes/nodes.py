@@ -19,7 +19,7 @@ from warpfiber.laws.flow import make_flow
 from warpfiber.laws.stretching import make_stretching
 from warpfiber.laws.torque import make_torque
 from warpfiber.laws.wall import make_wall
-from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN, precision
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN, precision
 from warpfiber.passes.precision import group_struct
 
 # A segment longer than this many rest lengths is no longer a physical state but a diverging step.
@@ -141,6 +141,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
         decay: real,
         list_reach: real,
         skin: real,
+        stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -319,5 +320,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
         if wp.static(has_pairs):
             if limit < zero or furthest > limit * limit:
                 status[wp.static(EXPIRED)] = 1
+            if longest > stretch_allowed * g.rest:
+                status[wp.static(STRETCHED)] = 1
 
     return node_sweep

@@ -1,0 +1,100 @@
+"""The reader of CUDA machine code in tools/compile_cuda.py, on kernels whose cost is known."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import warp as wp
+
+from warpfiber.passes.clock import make_clock
+
+TOOL = Path(__file__).parents[2] / "tools" / "compile_cuda.py"
+
+
+def _tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("compile_cuda", TOOL)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["compile_cuda"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+tool = _tool()
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+def scale(factor: wp.float32, values: wp.array(dtype=wp.float32)):  # type: ignore[valid-type]
+    i = wp.tid()
+    values[i] = factor * values[i]
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+def pick(places: wp.array(dtype=wp.int32), values: wp.array(dtype=wp.float32)):  # type: ignore[valid-type]
+    """An array of the thread that is indexed by data cannot live in registers."""
+    i = wp.tid()
+    row = wp.vector(length=64, dtype=wp.float32)
+    for k in range(64):
+        row[places[k]] = values[k]
+    values[i] = row[places[i]]
+
+
+@pytest.fixture(scope="module")
+def cubin(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("cubin")
+
+    def compiled(kernel: Any) -> Path:
+        try:
+            paths = wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=False)
+        except RuntimeError as fault:
+            pytest.skip(f"no CUDA compiler: {fault}")
+        return Path(paths[0])
+
+    return compiled
+
+
+def test_a_kernel_that_fits_has_no_frame(cubin: Any) -> None:
+    cost = tool.read_cost(cubin(scale), "scale", "", 80)
+    assert cost.frame == 0
+    assert 2 <= cost.registers <= 32
+    assert tool.frame_faults([cost]) == []
+
+
+def test_a_kernel_that_does_not_fit_is_a_fault(cubin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = tool.read_cost(cubin(pick), "pick", "", 80)
+    assert cost.frame >= 64 * 4
+    (fault,) = tool.frame_faults([cost])
+    assert "pick" in fault and str(cost.frame) in fault
+    monkeypatch.setitem(tool.FRAMES, "pick", (cost.frame, "its array is indexed by data"))
+    assert tool.frame_faults([cost]) == []
+
+
+def test_what_is_no_cubin_is_refused() -> None:
+    with pytest.raises(ValueError, match="ELF"):
+        tool.CudaElf(b"PTX, not ELF" + bytes(100))
+
+
+def test_a_kernel_without_cubin_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wp, "compile_aot_module", lambda *_, **__: [])
+    monkeypatch.setattr(tool, "kernels", lambda _: [("scale", "plain", scale)])
+    costs, failures = tool.compile_all((80, 90), Path("nowhere"))
+    assert not costs
+    assert failures == ["scale (float32 plain): 0 files for 2 architectures"]
+
+
+def test_every_pass_is_compiled_in_both_precisions() -> None:
+    from warpfiber.passes.cells import ListFeatures, make_list_kernels
+
+    listed = make_list_kernels("float32", ListFeatures((True, True, True)))
+    names = {kernel for kernel, _, _ in tool.kernels("float32")}
+    assert names == {
+        *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
+        *listed,
+    }
+    assert tool.PRECISIONS == ("float32", "float64")
+    assert make_clock("float32", False, False) in [made for *_, made in tool.kernels("float32")]
