@@ -83,7 +83,7 @@ class Job:
                 fiber_group=simulation.model.host["fiber_group"],
                 scene_json=json.dumps(job.scene.as_dict()),
                 attrs=job._attrs(),
-                node_fields=job.scene.record.node_fields,
+                node_fields=[f"node_{name}" for name in job.scene.record.node_fields],
             )
         return job
 
@@ -297,7 +297,7 @@ class Job:
         simulation = self.simulation
         fields = {}
         if "velocity" in self.scene.record.node_fields:
-            fields["velocity"] = simulation.node_velocity
+            fields["node_velocity"] = simulation.node_velocity
         self.trajectory.append(
             simulation.step_count,
             simulation.time,

@@ -231,6 +231,8 @@ class Simulation:
         """Copies of every array that the next step depends on, in run units and full precision."""
         self.method.prepare()
         arrays = {name: getattr(self.state, name).numpy().copy() for name in _ARRAYS}
+        if self.method.list is not None:
+            arrays["stretch_allowed"] = np.asarray(self.method.list.stretch_allowed)
         if self.measurement.angle is not None:
             arrays["angle"] = self.measurement.angle.copy()
         return arrays
@@ -243,6 +245,7 @@ class Simulation:
             getattr(state, name).assign(arrays[name])
         if self.method.list is not None:
             # the list of the snapshot was built from other positions: build the same one again
+            self.method.list.set_stretch(float(arrays["stretch_allowed"]))
             state.node_pos.assign(arrays["list_pos"])
             state.lattice.assign(arrays["list_lattice"])
             self.method.refresh_list(wrap=False)

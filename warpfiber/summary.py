@@ -7,7 +7,6 @@ import time
 from importlib import metadata
 from typing import Any
 
-from warpfiber import __version__
 from warpfiber.simulation import Simulation
 
 
@@ -19,7 +18,7 @@ def versions() -> dict[str, str]:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = __version__ if name == "warpfiber" else "not installed"
+            found[name] = "source tree" if name == "warpfiber" else "not installed"
     return found | {"python": platform.python_version()}
 
 

@@ -140,9 +140,6 @@ def test_rewind(start: Start, name: str) -> None:
         assert value.tobytes() == first[key].tobytes(), key
 
 
-@pytest.mark.xfail(
-    strict=True, reason="`restore` clears the pair count of the list: coordination_number is 0"
-)
 def test_measure_after_restore(start: Start) -> None:
     """All measured quantities of a restored run equal those before, at once."""
     quantities = ["orientation", "contacts", "interactions", "overlap", "energy", "rotation"]
@@ -155,10 +152,6 @@ def test_measure_after_restore(start: Start) -> None:
     assert run.measure() == again.measure()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="`restore` does not bring back the stretch that the list's cells allow: other rebuilds",
-)
 def test_restore_of_stretched_fibers(start: Start) -> None:
     """Soft fibers outgrow the cells of the list; the restored run must rebuild when the run did."""
     soft = Kind(3, 3.0, modulus=60.0)

@@ -104,6 +104,7 @@ CASES = [
     ("paper", "explicit", KINDS),
     ("paper", "explicit", REAL_KINDS),
     ("paper", "limited", KINDS),
+    ("paper", "limited", REAL_KINDS),
     ("shifted", "limited", KINDS),
 ]
 

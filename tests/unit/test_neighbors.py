@@ -1,4 +1,4 @@
-"""Neighbor list = brute force over all segments and images; exact up to the limit of its skin.
+"""Neighbor list = brute force over all segments and images, in every kind of box.
 
 Sets (i, j, image) are compared exactly: no distance of the seeded cells is within rounding of the
 reach. Brute force is `tests.reference.segments`, which looks at any image of any box.
@@ -6,76 +6,15 @@ reach. Brute force is `tests.reference.segments`, which looks at any image of an
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
-from tests.cell import Kind, bent_fiber, isotropic, listed_pairs, straight_fiber
+from tests.cell import Kind, isotropic, straight_fiber
+from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
 from tests.reference import segments as sg
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.simulation import Simulation
 
-SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
 PERIODIC = ["periodic"] * 3
-Start = Callable[..., Simulation]
-Pairs = set[tuple[int, int, tuple[int, int, int]]]
-
-
-def cell(
-    start: Start,
-    kinds: tuple[Kind, ...],
-    fibers: list[np.ndarray],
-    which: Any = None,
-    **keys: Any,
-) -> Simulation:
-    """Cell with pairs but weak forces, its list built."""
-    keys.setdefault("contact", {"law": "exponential", "strength": 1.0, "decay": 2.0})
-    sim = start(kinds, fibers, which, **keys)
-    sim.method.prepare()
-    return sim
-
-
-def brute_force(sim: Simulation, reach: float) -> Pairs:
-    """Pairs within `reach` (run units) of the present state."""
-    kinds = [sim.model.group_rows[g] for g in sim.model.host["fiber_group"]]
-    box = sim.scene.box
-    found = sg.find_pairs(
-        sim.state.node_pos.numpy().astype(float),
-        sim.fiber_node_start,
-        reach,
-        radius=np.array([row["radius"] for row in kinds]),
-        rest_length=np.array([row["rest"] for row in kinds]),
-        lattice=None if box is None else sim.state.lattice.numpy()[0],
-        periodic=sim.model.domain.periodic,
-    )
-    rows = set()
-    for pair in found:
-        image = pair.shift
-        if pair.i == pair.j and image < (0, 0, 0):
-            image = (-image[0], -image[1], -image[2])
-        rows.add((pair.i, pair.j, image))
-    return rows
-
-
-def check_list(sim: Simulation, least: int = 1) -> Pairs:
-    """The list holds exactly what is within reach + skin."""
-    pairs = sim.method.list
-    assert pairs is not None
-    listed = listed_pairs(sim)
-    assert listed == brute_force(sim, pairs.reach + pairs.skin)
-    assert len(listed) >= least
-    return listed
-
-
-def random_fibers(
-    kinds: tuple[Kind, ...], count: int, edges: Any, seed: int, spread: float = 1.0
-) -> tuple[list[np.ndarray], np.ndarray]:
-    rng = np.random.default_rng(seed)
-    which = np.arange(count) % len(kinds)
-    size = np.asarray(edges, float)
-    return [bent_fiber(kinds[k], rng, size * rng.random(3), spread) for k in which], which
 
 
 MIXED = (Kind(3, 3.0), Kind(6, 1.0, radius=0.6), Kind(1, 4.5))
@@ -237,79 +176,6 @@ def test_other_lattices(start: Start, gradient: list[list[float]]) -> None:
     assert np.abs(lattice - expected @ np.diag(edges)).max() < 1e-11 * 40
 
 
-@pytest.mark.parametrize(
-    ("flow", "steps"),
-    [
-        ({"kind": "rest", "viscosity": 1.0}, 150),
-        (SHEAR, 250),
-        ({"kind": "planar_extension", "extension_rate": 1.0, "viscosity": 1.0}, 100),
-    ],
-)
-def test_exact_up_to_the_skin(start: Start, flow: dict[str, Any], steps: int) -> None:
-    """At every step the list in use holds every pair within reach, through many rebuilds.
-
-    Stiff fibers of length 16 a rotate against the flow and gravity-free rest moves by start
-    velocities; a list one skin test too old would miss pairs.
-    """
-    kind = Kind(2, 4.0, modulus=3000.0)
-    edges = [36.0, 32.0, 40.0]
-    fibers, _ = random_fibers((kind,), 60, edges, seed=10, spread=5.0)
-    nodes = sum(map(len, fibers))
-    velocity = None
-    if flow["kind"] == "rest":
-        drift = np.random.default_rng(1).normal(size=(len(fibers), 3))
-        velocity = np.repeat(30.0 * drift, nodes // len(fibers), axis=0)
-    sim = cell(
-        start,
-        (kind,),
-        fibers,
-        flow=flow,
-        box={"size": edges},
-        velocity=velocity,
-        numerics={"dt": 2e-3},
-        contact={"law": "exponential", "strength": 20.0, "decay": 5.0},
-    )
-    pairs = sim.method.list
-    assert pairs is not None
-    seen = 0
-    for _ in range(steps):
-        sim.step()
-        near = brute_force(sim, pairs.reach)
-        missing = near - listed_pairs(sim)
-        assert not missing, f"step {sim.step_count}: {missing}"
-        seen += len(near)
-    assert pairs.build_count >= 5
-    assert pairs.build_count < steps, "the skin never holds"
-    assert seen > 20 * steps
-
-
-@pytest.mark.parametrize("flow", [SHEAR, {**SHEAR, "kind": "planar_extension"}])
-def test_exact_while_the_flow_squeezes(start: Start, flow: dict[str, Any]) -> None:
-    """Short fibers go with the flow: only its strain, not their motion beside it, brings them near.
-
-    Pairs of two beads move less than 0.3 a beside the flow while gaps of 2.6 a close to 2 a.
-    """
-    flow = {key: value for key, value in flow.items() if key != "shear_rate"}
-    flow["extension_rate" if flow["kind"] == "planar_extension" else "shear_rate"] = 1.0
-    kind = Kind(1, 1.0, density=1e-2)
-    fibers, _ = random_fibers((kind,), 220, [26.0] * 3, seed=15)
-    sim = cell(
-        start,
-        (kind,),
-        fibers,
-        flow=flow,
-        box={"size": [26.0] * 3},
-        contact={"law": "exponential", "strength": 1e-3, "decay": 1.0},
-        numerics={"dt": 2e-3},
-    )
-    pairs = sim.method.list
-    for _ in range(40):
-        sim.step(5)
-        missing = brute_force(sim, pairs.reach) - listed_pairs(sim)
-        assert not missing, f"strain {sim.strain}: {missing}"
-    assert 4 <= pairs.build_count < 40
-
-
 def test_capacities_grow(start: Start) -> None:
     """Rows and pairs that start at one grow until everything fits: the same list."""
     fibers, which = random_fibers(MIXED, 90, [40.0] * 3, seed=2)
@@ -364,33 +230,3 @@ def test_contact_count(start: Start, orientation: str) -> None:
     pairs = 0.5 * expected * count
     assert abs(row["contacts_per_fiber"] - expected) < 4.0 * expected / np.sqrt(pairs)
     assert row["coordination_number"] == row["contacts_per_fiber"]  # one segment per fiber
-
-
-def test_stretched_segments(start: Start) -> None:
-    """Segments far longer than at rest stay inside the cells: at the start and while they stretch.
-
-    Node velocities pull every segment to about 1.6 rest lengths within 60 steps.
-    """
-    kind = Kind(2, 4.0, modulus=1e-3)
-    fibers, _ = random_fibers((kind,), 40, [42.0] * 3, seed=14, spread=5.0)
-    fibers = [nodes.mean(axis=0) + 1.3 * (nodes - nodes.mean(axis=0)) for nodes in fibers]
-    velocity = np.concatenate([5.0 * (nodes - nodes.mean(axis=0)) for nodes in fibers])
-    sim = cell(
-        start,
-        (kind,),
-        fibers,
-        velocity=velocity,
-        flow={"kind": "rest", "viscosity": 1e-3},
-        numerics={"dt": 1e-3},
-        box={"size": [42.0] * 3},
-    )
-    check_list(sim, least=20)
-    pairs = sim.method.list
-    for _ in range(12):
-        sim.step(5)
-        assert not brute_force(sim, pairs.reach) - listed_pairs(sim)
-    nodes = sim.node_pos.reshape(-1, 3, 3)
-    stretch = np.linalg.norm(np.diff(nodes, axis=1), axis=2) / 8.0
-    assert 1.5 < stretch.max() < 2.0
-    sim.method.refresh_list()
-    check_list(sim, least=20)

@@ -308,13 +308,14 @@ class BeadChain:
             assert self.executor is not None
             self.executor.run(target - self.step_count, self._halted)
             status = self._status()
-            if status[TORN]:
+            torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
+            if torn:
                 return False
-            if status[STRETCHED] and self.list is not None:
+            if stretched and self.list is not None:
                 self.list.allow_stretch(STRETCH_GROWTH)
                 self.check_box()
                 self._stop_executor()
-            if status[EXPIRED] or status[STRETCHED]:
+            if expired or stretched:
                 self.refresh_list()
         return True
 

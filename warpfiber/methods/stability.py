@@ -21,6 +21,7 @@ from warpfiber.laws.closure import galerkin_entries
 from warpfiber.scene import FiberGroup, Scene
 
 CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
+EXACT_NODES = 13  # fibers of up to so many nodes get the exact limit of their linear motion
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
 
 
@@ -63,6 +64,62 @@ def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[np.ndarray, 
     return axial, bending, torque, galerkin
 
 
+def _published_closure(n: int, m: float) -> tuple[np.ndarray, ...]:
+    """Inertia and drag of a straight fiber along and across it, in beads per node.
+
+    m dv/dt = a F^ND + b F^D is the same as (m / a) dv/dt = F^ND + (b / a) F^D. Along: alpha^T and
+    beta^T; across: alpha^R and beta^R. The middle node of an even number of segments lies on the
+    center, and the two exchange there.
+    """
+    total = n * m + 1.0
+    along = np.full(n + 1, (n + 1.0) / total)
+    across = np.full(n + 1, m * (n + 1.0) * (n + 2.0) / (total * (total + 1.0)))
+    drag_along, drag_across = np.full(n + 1, m), np.full(n + 1, m)
+    drag_along[[0, -1]] = (m + 1.0) / 2.0
+    drag_across[[0, -1]] = (m + 1.0) * (3.0 * m * n - 2.0 * m + 2.0) / (6.0 * m * n)
+    if n % 2 == 0:
+        # however little it bends, the line to the middle node then points across the fiber
+        middle = n // 2
+        along[middle], across[middle] = across[middle], along[middle]
+        # beta^R / alpha^R of Eq. (8) for a parabola, where n_i - n_(i-1) = -24 / (n (n + 2)) N3_i
+        drag_along[middle] = m - 4.0 * (m * m - 1.0) / (m * n * (n + 2.0))
+    # beta = alpha times the drag of a node in beads, for both directions
+    return np.diag(1.0 / along), np.diag(drag_along), np.diag(1.0 / across), np.diag(drag_across)
+
+
+def _stable_limit(
+    stiffness: np.ndarray, damping: np.ndarray, inertia: np.ndarray, drag: np.ndarray, mass: float
+) -> float:
+    """Largest stable step of M x'' = -K x - C x': exact for few nodes, else mode by mode."""
+    limit = _slowest_mode_limit(stiffness, damping, inertia, drag, mass)
+    if len(stiffness) > EXACT_NODES or not 0.0 < limit < math.inf:
+        return limit
+    return _exact_limit(stiffness, damping + drag, mass * inertia, limit)
+
+
+def _exact_limit(
+    stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray, near: float
+) -> float:
+    """Step at which the amplification matrix gets an eigenvalue beyond 1, by bisection.
+
+    Where the damping of few nodes differs much (`paper`), the stiffness alone has other modes.
+    """
+    inverse = np.linalg.inv(mass)
+    k, c, eye = inverse @ stiffness, inverse @ damping, np.eye(len(mass))
+
+    def is_stable(dt: float) -> bool:
+        velocity = np.hstack([-dt * k, eye - dt * c])
+        position = np.hstack([eye, np.zeros_like(eye)]) + dt * velocity
+        step = np.vstack([position, velocity])
+        return bool(np.abs(np.linalg.eigvals(step)).max() < 1.0 + 1e-6)
+
+    low, high = near / 16.0, 16.0 * near
+    while high / low > 1.0 + 1e-4:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    return low
+
+
 def _slowest_mode_limit(
     stiffness: np.ndarray, damping: np.ndarray, inertia: np.ndarray, drag: np.ndarray, mass: float
 ) -> float:
@@ -88,26 +145,21 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     n = group.segments
     eye = np.eye(n + 1)
     closure = scene.numerics.closure
-    if closure == "consistent":
-        inertia, drag, along, across = galerkin, zeta * galerkin, 1.0, 1.0
-    elif closure == "none":
-        inertia, drag, along, across = eye, zeta * eye, 1.0, 1.0
+    if closure == "paper":
+        axial_inertia, axial_drag, inertia, drag = _published_closure(n, m)
     else:
-        total = n * m + 1.0
-        along = (n + 1.0) / total
-        across = m * (n + 1.0) * (n + 2.0) / (total * (total + 1.0))
-        beta = np.full(n + 1, m)
-        beta[0] = beta[-1] = (m + 1.0) / 2.0
-        inertia, drag = eye, zeta * along * np.diag(beta)
+        inertia = drag = galerkin if closure == "consistent" else eye
+        axial_inertia, axial_drag = inertia, drag
+    still = np.zeros_like(axial)
     limits = [
         StepLimit(
             "stretching",
-            _slowest_mode_limit(along * axial, np.zeros_like(axial), inertia, drag, mass),
+            _stable_limit(axial, still, axial_inertia, zeta * axial_drag, mass),
             index,
         ),
         StepLimit(
             "bending and hydrodynamic torque",
-            _slowest_mode_limit(across * bending, across * torque, inertia, drag, mass),
+            _stable_limit(bending, torque, inertia, zeta * drag, mass),
             index,
         ),
     ]

@@ -88,10 +88,14 @@ class NeighborList:
         return 1.02 * self.stretch_allowed * self.longest_rest + self.reach + self.skin
 
     def allow_stretch(self, factor: float) -> None:
-        """Widen the cells for longer segments; the next build uses them."""
-        self.stretch_allowed *= factor
-        self._graphs = {}
+        """Widen the cells for longer segments; build the list before the next step."""
+        self.set_stretch(factor * self.stretch_allowed)
         self.state.status.zero_()
+
+    def set_stretch(self, stretch: float) -> None:
+        """Cells that hold segments of this many rest lengths, from the next build on."""
+        self.stretch_allowed = stretch
+        self._graphs = {}
 
     def _allocate_rows(self) -> None:
         size, device = self.model.segment_count * self.row_capacity, self.model.device

@@ -196,8 +196,8 @@ def make_pair_geometry(name: str, features: PairFeatures):
                     weight *= gj.bead_weight
                 velocity = (one - t) * vj0 + t * vj1 - (one - s) * vi0 - s * vi1
                 gap = wp.sqrt(cc) - contact
-                resistance = lubrication_resistance(scale, gap, shift, inverse_mass_dt)
-                f = (weight * resistance * wp.dot(velocity, c) / cc) * c
+                resistance = lubrication_resistance(weight * scale, gap, shift, inverse_mass_dt)
+                f = (resistance * wp.dot(velocity, c) / cc) * c
                 force += f
                 arm_i += s * f
                 arm_j += t * f
