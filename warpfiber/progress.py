@@ -79,15 +79,18 @@ class Lines:
     def update(self, job: Any) -> None:
         """Print the present state of `job` if the last line is old enough."""
         name, value, end = _goal(job)
-        if self._from is None:
-            self._from = value
         now = time.monotonic()
+        if self._from is None:
+            self._from, self._begin = value, now
         if now - self._last < LINE_EVERY:
             return
         self._last = now
-        left = (now - self._begin) * (end - value) / max(value - self._from, 1e-12)
-        text = ", ".join(f"{key} {shown}" for key, shown in _values(job).items())
-        print(f"{name} {value:.3f} of {end:g}, {left:.0f} s left, {text}", file=sys.stderr)
+        done = value - self._from
+        left = (now - self._begin) * max(end - value, 0.0) / done if done > 0.0 else None
+        words = [f"{name} {value:.3f} of {end:g}", f"{job.summary.step_rate:.0f} steps/s"]
+        words += [] if left is None else [f"{left:.0f} s left"]
+        words += [f"{key} {shown}" for key, shown in _values(job).items()]
+        print(", ".join(words), file=sys.stderr)
 
     def close(self) -> None:
         """Nothing to leave behind."""

@@ -56,6 +56,11 @@ class Summary:
         return max(1, int(seconds * self.steps / self.stepping_seconds))
 
     @property
+    def step_rate(self) -> float:
+        """Steps per second so far."""
+        return self.steps / max(self.stepping_seconds, 1e-9)
+
+    @property
     def wall_seconds(self) -> float:
         """Wall time of the run so far, earlier parts of a resumed run included."""
         return self.wall_before + time.perf_counter() - self.started
