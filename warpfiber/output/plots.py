@@ -303,9 +303,23 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
     words = {"strain": strain, "time": "time (s)"}
     axes.set_xlabel(words.get(against, against), color=_INK)
     axes.set_ylabel(curves.ylabel, color=_INK)
-    axes.set_title(curves.title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=10)
-    if len(runs) == 1 and scene.get("title"):
-        axes.set_title(str(scene["title"])[:60], loc="right", fontsize=9, color=_GRAY, pad=10)
+    words_of_scene = str(scene.get("title") or "")[:60] if len(runs) == 1 else ""
+    # beside the title where both fit into the width, else below it
+    beside = 1.5 * len(curves.title) + len(words_of_scene) < 62
+    pad = 10 if beside or not words_of_scene else 24
+    axes.set_title(curves.title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=pad)
+    if words_of_scene:
+        axes.annotate(
+            words_of_scene,
+            (1.0 if beside else 0.0, 1.0),
+            (0, 10 if beside else 8),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            ha="right" if beside else "left",
+            va="bottom",
+            fontsize=9,
+            color=_GRAY,
+        )
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
