@@ -120,18 +120,20 @@ def test_several_runs_share_axes(tmp_path: Path) -> None:
 
 def test_references_beside_the_scene_are_drawn(tmp_path: Path) -> None:
     (tmp_path / "reference").mkdir()
-    (tmp_path / "reference" / "figure_7.csv").write_text(
+    (tmp_path / "reference" / "cell_figure_7.csv").write_text(
         "# read by eye\nstrain,a11\n0,0.3\n5,0.7\n"
     )
-    (tmp_path / "reference" / "words.csv").write_text("who,what\na,b\n")
-    (tmp_path / "reference" / "ragged.csv").write_text("strain,a11\n1,2\n1\n")
-    (tmp_path / "reference" / "empty.csv").write_text("# nothing\n")
+    (tmp_path / "reference" / "other_scene.csv").write_text("strain,a11\n0,0.1\n5,0.2\n")
+    (tmp_path / "reference" / "cell_words.csv").write_text("who,what\na,b\n")
+    (tmp_path / "reference" / "cell_ragged.csv").write_text("strain,a11\n1,2\n1\n")
+    (tmp_path / "reference" / "cell_empty.csv").write_text("# nothing\n")
     folder = _run(tmp_path / "run", path=str(tmp_path / "cell.toml"))
     plot_run(folder)
     rows = _table(folder.path / "figures" / "orientation.csv")
-    points = [row["value"] for row in rows if row["run"] == "reference figure_7"]
+    points = [row["value"] for row in rows if row["run"] == "reference cell_figure_7"]
     assert [float(value) for value in points] == [0.3, 0.7]
-    assert {row["run"] for row in rows} == {"run", "reference figure_7"}
+    assert not [row for row in rows if "other_scene" in row["run"]]
+    assert {row["run"] for row in rows} == {"run", "reference cell_figure_7"}
 
 
 @pytest.mark.parametrize("axis, channel", [(0, 0), (1, 1), (2, 2)])
