@@ -303,7 +303,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--set", action="append", default=[], type=_override)
     parser.add_argument("--dry", action="store_true", help="print only")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
     for row in globals()[args.bench](args):
         line = json.dumps(row)
         print(line, flush=True)
