@@ -91,23 +91,25 @@ def _load(args: argparse.Namespace) -> Any:
 def _run(args: argparse.Namespace) -> int:
     from warpfiber.job import Job
     from warpfiber.progress import make_progress
+    from warpfiber.stopping import Stopper
 
     options = {
         "device": args.device,
         "workers": args.workers,
         "progress": make_progress(args.quiet),
     }
-    if args.command == "run":
-        scene = _load(args)
-        job = Job.start(scene, out=args.out, overwrite=args.overwrite, **options)
+    with Stopper(args.max_wall) as stopper:  # placing and compiling count, and can be stopped
+        if args.command == "run":
+            scene = _load(args)
+            job = Job.start(scene, out=args.out, overwrite=args.overwrite, **options)
+            if not args.quiet:
+                for note in scene.notes:
+                    print(f"note: {note}")
+        else:
+            job = Job.resume(args.folder, **options)
         if not args.quiet:
-            for note in scene.notes:
-                print(f"note: {note}")
-    else:
-        job = Job.resume(args.folder, **options)
-    if not args.quiet:
-        print(job.describe(), flush=True)
-    code = job.run(max_wall=args.max_wall)
+            print(job.describe(), flush=True)
+        code = job.run(stopper)
     _finish(job, code, args.quiet)
     return code
 
@@ -143,15 +145,18 @@ def _finish(job: Any, code: int, quiet: bool) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
+    from warpfiber.build import realized_scene
     from warpfiber.checking import check_lines
+    from warpfiber.placement import place_fibers
     from warpfiber.simulation import check_step
 
     scene = _load(args)
+    if any(group.node_file for group in scene.fibers):
+        scene = realized_scene(scene, place_fibers(scene))
     print("\n".join(check_lines(scene)))
     for note in scene.notes:
         print(f"note: {note}")
-    if not any(group.node_file for group in scene.fibers):
-        check_step(scene)
+    check_step(scene)
     return 0
 
 

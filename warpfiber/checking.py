@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from warpfiber.methods.bead_chain import LIST_SKIN, contact_reach
-from warpfiber.methods.box_limits import strain_limit
+from warpfiber.methods.box_limits import bearable_strain
 from warpfiber.methods.stability import chosen_step, step_limits
+from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
     bead_count,
@@ -53,23 +52,17 @@ def record_bytes(scene: Scene) -> float:
 
 
 def box_strain_limit(scene: Scene) -> float:
-    """Strain that a periodic box in a flow other than simple shear along its axes can bear."""
-    box, flow = scene.box, scene.flow
-    if box is None or flow is None or flow.rate == 0.0 or flow.velocity_gradient is None:
-        return math.inf
-    gradient = np.asarray(flow.velocity_gradient)
-    if any(kind != "periodic" for kind in box.boundary) or np.count_nonzero(gradient) == 1:
+    """Strain that the scene's periodic box can bear; raises SceneError if it is too small."""
+    if contact_reach(scene) == 0.0:
         return math.inf
     diameter = max(group.diameter for group in scene.fibers)
     skin = LIST_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
-    width = 1.071 * longest_segment(scene) + contact_reach(scene) * diameter + skin
-    return strain_limit(np.asarray(box.size), gradient, flow.rate, width)
+    longest = CELL_SLACK * FIRST_STRETCH * longest_segment(scene)
+    return bearable_strain(scene, longest + contact_reach(scene) * diameter + skin)
 
 
 def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str, str]]:
     head = f"fibers.{index}"
-    if group.node_file is not None:
-        return [(head, f"read from {group.node_file}")]
     rows = [
         (f"{head} count", f"{group.count}"),
         ("aspect ratio r_f", _number(group.aspect_ratio)),
@@ -101,15 +94,14 @@ def check_lines(scene: Scene) -> list[str]:
     for index, group in enumerate(scene.fibers):
         rows += _group_lines(scene, index, group)
     rows.append(("total strain", _number(total_strain(scene))))
-    if not any(group.node_file for group in scene.fibers):
-        limits, dt = step_limits(scene), chosen_step(scene)
-        for limit in limits:
-            rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
-        share = dt / limits[0].dt
-        rows.append(("dt", f"{dt:.4g} s = {share:.3g} of the limit set by {limits[0].term}"))
-        strain = total_strain(scene)
-        if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
-            rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
+    limits, dt = step_limits(scene), chosen_step(scene)
+    for limit in limits:
+        rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
+    share = dt / limits[0].dt
+    rows.append(("dt", f"{dt:.4g} s = {share:.3g} of the limit set by {limits[0].term}"))
+    strain = total_strain(scene)
+    if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
+        rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
     if contact_reach(scene) > 0.0:
         skin = scene.numerics.skin
         text = f"auto, {LIST_SKIN} diameters" if skin is None else f"{skin:.3g} m"

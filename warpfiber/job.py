@@ -8,9 +8,11 @@ last good state and, beside it, the bad one.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,10 @@ import numpy as np
 
 from warpfiber.output.checkpoint import write_checkpoint
 from warpfiber.output.folder import ResultFolder
-from warpfiber.output.scalars import ScalarsWriter
-from warpfiber.output.trajectory import TrajectoryWriter
+from warpfiber.recording import Recording
 from warpfiber.restart import read_restart
-from warpfiber.scene import Scene, SceneError, Stage
-from warpfiber.simulation import BoxExhausted, Diverged, Simulation
+from warpfiber.scene import Fault, Scene, SceneError, Stage
+from warpfiber.simulation import BoxExhausted, Diverged, Simulation, preflight, with_device
 from warpfiber.stopping import Stopper
 from warpfiber.summary import Summary, versions
 
@@ -45,12 +46,10 @@ class Job:
         self.row_index = 0
         self.frame_index = 0
         self.fresh = True  # the row and the frame of the start are still to be written
-        self.last_row: dict[str, float] = {}
         self.good: dict[str, np.ndarray] = {}
         self.good_attrs: dict[str, Any] = {}
         self.summary = Summary(simulation)
-        self.scalars: ScalarsWriter
-        self.trajectory: TrajectoryWriter | None = None
+        self.record: Recording
         self.passes: dict[str, list[float]] = {}
 
     # -- starting ---------------------------------------------------------------------------------
@@ -66,25 +65,22 @@ class Job:
         workers: int | None = None,
         progress: Any = None,
     ) -> Job:
-        """Build the scene, then make the folder: nothing is written if the scene has a fault."""
-        simulation = Simulation(scene, device=device, workers=workers)
+        """Build the scene, then make the folder: nothing is written if there is a fault.
+
+        Raises SceneError, with all faults of device, dt and folder together before placing fibers.
+        """
+        scene = with_device(scene, device)
+        faults = _faults_of(preflight, scene) + _faults_of(ResultFolder.check, out, overwrite)
+        if faults:
+            raise SceneError(faults)
+        simulation = Simulation(scene, workers=workers)
         folder = ResultFolder.create(out, scene.name, overwrite)
         job = cls(simulation, folder, progress=progress)
         folder.write_scene(job.scene.as_dict())
         folder.log(f"warpfiber {versions()['warpfiber']}: {job.scene.path}, {job.describe()}")
         for note in job.scene.notes:
             folder.log(f"note: {note}")
-        row = simulation.measure()
-        job.scalars = ScalarsWriter(folder.scalars_path, list(row))
-        if job.scene.record.trajectory:
-            job.trajectory = TrajectoryWriter(
-                folder.trajectory_path,
-                fiber_node_start=simulation.fiber_node_start,
-                fiber_group=simulation.model.host["fiber_group"],
-                scene_json=json.dumps(job.scene.as_dict()),
-                attrs=job._attrs(),
-                node_fields=[f"node_{name}" for name in job.scene.record.node_fields],
-            )
+        job.record = Recording.start(job.scene, simulation, folder, job._attrs())
         return job
 
     @classmethod
@@ -105,22 +101,20 @@ class Job:
             device=device or attrs["device"],
             workers=workers,
             placement=restart.placement,
+            dt=float(attrs["dt"]),
         )
         simulation.restore(restart.arrays)
         job = cls(simulation, folder, progress=progress)
         job.scene = dataclasses.replace(simulation.scene, fibers=restart.fibers)
         job.fresh = False
-        job.last_row = dict(attrs["last_row"])
-        job.summary.restore(job.last_row, attrs["half_turns"])
+        job.summary.restore(attrs["last_row"], attrs["half_turns"])
         job.stage_index = int(attrs["stage_index"])
         job.stage_start = (float(attrs["stage_strain"]), float(attrs["stage_time"]))
         job.row_index, job.frame_index = int(attrs["row_index"]), int(attrs["frame_index"])
         job.summary.wall_before = float(attrs["wall_seconds"])
-        step = simulation.step_count
-        job.scalars = ScalarsWriter.reopen(folder.scalars_path, step)
-        if job.scene.record.trajectory:
-            job.trajectory = TrajectoryWriter.reopen(folder.trajectory_path, step)
-        folder.log(f"resumed at step {step} from {restart.path.name}")
+        frame_step = int(attrs["frame_step"])
+        job.record = Recording.reopen(job.scene, simulation, folder, attrs["last_row"], frame_step)
+        folder.log(f"resumed at step {simulation.step_count} from {restart.path.name}")
         return job
 
     def describe(self) -> str:
@@ -136,14 +130,17 @@ class Job:
 
     # -- the loop ---------------------------------------------------------------------------------
 
-    def run(self, *, max_wall: float | None = None) -> int:
-        """Run to the end of the last stage; returns the exit code (0, 3, 130 or 143)."""
+    def run(self, stopper: Stopper | None = None) -> int:
+        """Run to the end of the last stage; returns the exit code (0, 3, 130 or 143).
+
+        `stopper` collects the requests to stop; without one, Ctrl-C is caught while this runs.
+        """
         if self.stage_index >= len(self.stages):
             self._close()
             self.folder.log("nothing left to do")
             return 0
         code = 0
-        with Stopper(max_wall) as stopper:
+        with contextlib.nullcontext(stopper) if stopper else Stopper() as stopper:
             try:
                 self.simulation.method.prepare()
                 self.summary.begin()
@@ -188,8 +185,9 @@ class Job:
                 return 3
         if stopper.reason:
             return 0
-        self._record_due()
-        if self._stage_steps(stage) <= 0:
+        ended = simulation.stage_steps(stage, self.stage_start) <= 0
+        self._record_due(last=ended)
+        if ended:
             self._end_stage(stage)
         return 0
 
@@ -197,17 +195,8 @@ class Job:
         row = self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
         frame = self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
         steps_to = self.simulation.steps_to
-        return [self._stage_steps(stage), steps_to(*row), steps_to(*frame)]
-
-    def _end_strain(self, stage: Stage) -> float | None:
-        flow = self.scene.flow  # a fluid at rest never reaches a strain
-        return stage.end_strain if flow is not None and flow.rate > 0.0 else None
-
-    def _stage_steps(self, stage: Stage) -> int:
-        end = self._end_strain(stage)
-        strain = None if end is None else self.stage_start[0] + end
-        moment = None if stage.end_time is None else self.stage_start[1] + stage.end_time
-        return self.simulation.steps_to(strain, moment)
+        end = self.simulation.stage_steps(stage, self.stage_start)
+        return [end, steps_to(*row), steps_to(*frame)]
 
     def _event_mark(
         self, stage: Stage, index: int, interval: tuple[str, float]
@@ -230,8 +219,9 @@ class Job:
 
     def _share(self, stage: Stage, count: int) -> tuple[str, float]:
         """`count` even parts of the whole run, in strain where the stages end by strain."""
-        ends = [self._end_strain(s) for s in self.stages]
-        if self._end_strain(stage) is not None:
+        flow = self.scene.flow
+        if stage.end_strain is not None and flow is not None and flow.rate > 0.0:
+            ends = [s.end_strain for s in self.stages]
             return "strain", sum(e for e in ends if e is not None) / count
         times = [s.end_time for s in self.stages]
         return "time", sum(t for t in times if t is not None) / count
@@ -255,8 +245,8 @@ class Job:
 
     # -- recording --------------------------------------------------------------------------------
 
-    def _record_due(self) -> None:
-        """Write the row and the frame whose marks have been reached (and those of the start)."""
+    def _record_due(self, last: bool = False) -> None:
+        """Write the row and the frame whose marks are reached, and those of a stage's ends."""
         simulation = self.simulation
         if self.stage_index >= len(self.stages):
             return
@@ -265,17 +255,15 @@ class Job:
         first, self.fresh = self.fresh, False
         row_index = self._reached(stage, self.row_index, self._row_interval(stage))
         frame_index = self._reached(stage, self.frame_index, self._frame_interval(stage))
-        row_due = first or row_index > self.row_index
+        step, record = simulation.step_count, self.record
+        row_due = first or row_index > self.row_index or (last and record.row_step < step)
         if row_due:
-            row = simulation.measure()
-            self.scalars.append(row)
-            self.last_row = row
-            self.summary.look_at(row)
+            self.summary.look_at(record.write_row())
             self.row_index = row_index
-        if first or frame_index > self.frame_index:
-            self._write_frame()
+        if first or frame_index > self.frame_index or (last and record.frame_step < step):
+            record.write_frame()
             self.frame_index = frame_index
-            if not first:
+            if not (first or last):
                 self._profile(stage)
         self.summary.recording_seconds += time.perf_counter() - begin
         if row_due:
@@ -290,23 +278,6 @@ class Job:
         while self.simulation.steps_to(*self._event_mark(stage, index + 1, interval)) <= 0:
             index += 1
         return index
-
-    def _write_frame(self) -> None:
-        if self.trajectory is None:
-            return
-        simulation = self.simulation
-        fields = {}
-        if "velocity" in self.scene.record.node_fields:
-            fields["node_velocity"] = simulation.node_velocity
-        self.trajectory.append(
-            simulation.step_count,
-            simulation.time,
-            simulation.strain,
-            simulation.node_pos,
-            simulation.lattice,
-            fields,
-            {k: v for k, v in self.last_row.items() if k not in ("step", "time", "strain")},
-        )
 
     def _profile(self, stage: Stage) -> None:
         """A few steps pass by pass, where that many are left before the next event."""
@@ -324,6 +295,7 @@ class Job:
 
     def _attrs(self) -> dict[str, Any]:
         return {
+            "version": versions()["warpfiber"],
             "hash": self.scene.hash,
             "device": self.simulation.device,
             "precision": self.scene.numerics.precision,
@@ -341,7 +313,8 @@ class Job:
             "row_index": self.row_index,
             "frame_index": self.frame_index,
             "wall_seconds": self.summary.wall_seconds,
-            "last_row": self.last_row,
+            "last_row": self.record.last_row,
+            "frame_step": self.record.frame_step,
             "half_turns": list(self.summary.half_turns),
         }
 
@@ -386,9 +359,16 @@ class Job:
         return 3
 
     def _close(self) -> None:
-        self.scalars.close()
-        if self.trajectory is not None:
-            self.trajectory.close()
+        self.record.close()
         self.simulation.close()
         if self.progress is not None:
             self.progress.close()
+
+
+def _faults_of(check: Callable[..., None], *arguments: Any) -> list[Fault]:
+    """The faults that a check raises; none if it passes."""
+    try:
+        check(*arguments)
+    except SceneError as found:
+        return list(found.faults)
+    return []

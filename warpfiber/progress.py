@@ -33,7 +33,7 @@ def _goal(job: Any) -> tuple[str, float, float]:
 
 
 def _values(job: Any) -> dict[str, str]:
-    row = job.last_row
+    row = job.record.last_row
     shown = {}
     for key, label in (("a11", "A_xx"), ("overlap_max", "overlap")):
         if key in row:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from warpfiber.methods.bead_chain import BeadChain
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.passes.measurement import Measurement
 from warpfiber.placement import Placement, place_fibers
-from warpfiber.scene import Fault, Scene, SceneError
+from warpfiber.scene import Fault, Scene, SceneError, Stage
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
 
@@ -71,6 +71,28 @@ def check_step(scene: Scene) -> tuple[float, list[StepLimit]]:
     return dt, limits
 
 
+def with_device(scene: Scene, device: str | None) -> Scene:
+    """The scene on another device; None leaves it."""
+    if device is None:
+        return scene
+    return dataclasses.replace(scene, numerics=dataclasses.replace(scene.numerics, device=device))
+
+
+def preflight(scene: Scene) -> None:
+    """All faults that need no fibers: device, dt. Raises SceneError with every one of them."""
+    probes: list[Callable[[Scene], object]] = [lambda scene: choose_device(scene, 0)]
+    if not any(group.node_file for group in scene.fibers):
+        probes.append(check_step)
+    faults: list[Fault] = []
+    for probe in probes:
+        try:
+            probe(scene)
+        except SceneError as found:
+            faults += found.faults
+    if faults:
+        raise SceneError(faults)
+
+
 class Simulation:
     """A scene under way. Positions and velocities are NumPy arrays in SI, fibers unwrapped."""
 
@@ -81,21 +103,20 @@ class Simulation:
         device: str | None = None,
         workers: int | None = None,
         placement: Placement | None = None,
+        dt: float | None = None,
     ) -> None:
-        """Place the fibers and allocate; `device`, `workers` override the scene's numerics.
+        """Place the fibers and allocate; `device`, `workers`, `dt` (s) override the numerics.
 
         Raises SceneError if the device does not exist, the fibers cannot be placed or dt is not
         stable.
         """
-        if device is not None:
-            numerics = dataclasses.replace(scene.numerics, device=device)
-            scene = dataclasses.replace(scene, numerics=numerics)
-        choose_device(scene, 0)
-        if not any(group.node_file for group in scene.fibers):
-            check_step(scene)
-        placement = placement or place_fibers(scene)
+        scene = with_device(scene, device)
+        if placement is None:
+            preflight(scene)
+            placement = place_fibers(scene)
         self.scene = realized_scene(scene, placement)
-        self.dt, self.limits = check_step(self.scene)
+        self.limits = step_limits(self.scene)
+        self.dt = check_step(self.scene)[0] if dt is None else dt
         segments = len(placement.node_pos) - len(placement.fiber_group)
         self.device = choose_device(self.scene, segments)
         self.model, self.state, self.placement_report = build(self.scene, self.device, placement)
@@ -113,7 +134,11 @@ class Simulation:
     # -- stepping ---------------------------------------------------------------------------------
 
     def step(self, count: int = 1) -> None:
-        """Advance `count` steps of dt; raises Diverged if a fiber tears, BoxExhausted."""
+        """Advance `count` steps of dt.
+
+        Raises Diverged if a fiber tears, BoxExhausted or SceneError if the flow or a stretched
+        segment leaves the periodic box too small.
+        """
         end = self.method.strain_end
         allowed = count if math.isinf(end) else min(count, self.steps_to(end, None))
         if not self.method.advance(allowed):
@@ -129,15 +154,29 @@ class Simulation:
     def run(self, until: float | None = None, *, time: float | None = None) -> None:
         """Advance to the strain `until`, or to `time` in s; default: the end of the last stage.
 
-        The end is reached to within one step. Raises Diverged if a fiber tears, BoxExhausted.
+        The end is reached to within one step. Raises what `step` raises.
         """
-        if until is None and time is None:
-            until, time = self._scene_end()
-        while True:
-            steps = self.steps_to(until, time)
-            if steps <= 0:
-                return
-            self.step(steps)
+        if until is not None or time is not None:
+            while (steps := self.steps_to(until, time)) > 0:
+                self.step(steps)
+            return
+        start = (0.0, 0.0)
+        for stage in self.scene.stage_sequence:
+            while (steps := self.stage_steps(stage, start)) > 0:
+                self.step(steps)
+            start = (
+                self.strain if stage.end_strain is None else start[0] + stage.end_strain,
+                self.time if stage.end_time is None else start[1] + stage.end_time,
+            )
+
+    def stage_steps(self, stage: Stage, start: tuple[float, float]) -> int:
+        """Steps that surely do not pass the end of a stage begun at `start` = (strain, time)."""
+        flow = self.scene.flow  # a fluid at rest never reaches a strain
+        moving = flow is not None and flow.rate > 0.0
+        return self.steps_to(
+            start[0] + stage.end_strain if moving and stage.end_strain is not None else None,
+            start[1] + stage.end_time if stage.end_time is not None else None,
+        )
 
     def steps_to(self, strain: float | None, time: float | None) -> int:
         """Steps that surely do not pass the first of the two marks; 0 if one is reached."""
@@ -157,14 +196,6 @@ class Simulation:
             return 0
         # a mark counts as reached within a millionth of a step: rounding must not add a step
         return max(0, math.ceil(min(counts) - 1e-6))
-
-    def _scene_end(self) -> tuple[float | None, float | None]:
-        stages = self.scene.stage_sequence
-        strains = [s.end_strain for s in stages]
-        if all(value is not None for value in strains):
-            return sum(value for value in strains if value is not None), None
-        times = [s.end_time for s in stages]
-        return None, sum(value for value in times if value is not None)
 
     def close(self) -> None:
         """Stop worker threads; the state stays readable."""
@@ -194,8 +225,11 @@ class Simulation:
 
     @property
     def node_velocity(self) -> np.ndarray:
-        """(N, 3) m/s; in a sheared box that of the image inside the box."""
+        """(N, 3) m/s of the unwrapped nodes."""
         velocity: np.ndarray = self.state.node_velocity.numpy().astype(float)
+        if self.model.domain.sheared:  # an image moves with the flow's difference between the two
+            gradient = np.asarray(self.state.gradient.numpy()[0], dtype=float)
+            velocity = velocity + self._image_shift() @ gradient.T
         return velocity * self.model.units.velocity
 
     @property
@@ -212,12 +246,15 @@ class Simulation:
         return np.asarray(self.state.lattice.numpy()[0]) * self.model.units.length
 
     def _unwrapped(self) -> np.ndarray:
-        counts = np.diff(self.fiber_node_start)
+        nodes = np.asarray(self.state.node_pos.numpy(), dtype=float)
+        unwrapped: np.ndarray = nodes + self._image_shift()
+        return unwrapped
+
+    def _image_shift(self) -> np.ndarray:
+        """(N, 3) from the image inside the box to the unwrapped node, run units."""
         image = np.asarray(self.state.fiber_image.numpy(), dtype=float)
         shift = image @ np.asarray(self.state.lattice.numpy()[0]).T
-        nodes = np.asarray(self.state.node_pos.numpy(), dtype=float)
-        unwrapped: np.ndarray = nodes + np.repeat(shift, counts, axis=0)
-        return unwrapped
+        return np.repeat(shift, np.diff(self.fiber_node_start), axis=0)
 
     def measure(self) -> dict[str, float]:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
@@ -245,7 +282,7 @@ class Simulation:
             getattr(state, name).assign(arrays[name])
         if self.method.list is not None:
             # the list of the snapshot was built from other positions: build the same one again
-            self.method.list.set_stretch(float(arrays["stretch_allowed"]))
+            self.method.set_stretch(float(arrays["stretch_allowed"]))
             state.node_pos.assign(arrays["list_pos"])
             state.lattice.assign(arrays["list_lattice"])
             self.method.refresh_list(wrap=False)
@@ -260,14 +297,16 @@ class Simulation:
     def _torn_report(self) -> dict[str, Any]:
         torn = self.method.torn_fiber()
         smallest = self.limits[0]
-        finite = {k: v for k, v in torn["terms"].items() if math.isfinite(v)}
-        force = finite.get(torn["largest_term"], math.inf)
+        force = torn["terms"][torn["largest_term"]]
+        reason = ""
+        if self.dt < smallest.dt:
+            reason = "; dt is below it: too soft a fiber for this flow, or a start that overlaps"
         torn["message"] = (
             f"diverged at step {self.step_count}, time {self.time:.6g} s, strain "
             f"{self.strain:.6g}: fiber {torn['fiber']} is torn at node {torn['node']} (segment at "
             f"{torn['stretch']:.3g} times its rest length); largest term: {torn['largest_term']} "
             f"({force:.3g} N); dt = {self.dt:.4g} s, limit {smallest.dt:.4g} s set by "
-            f"{smallest.term}"
+            f"{smallest.term}{reason}"
         )
         return torn
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from warpfiber.simulation import Simulation
@@ -95,7 +96,7 @@ class Summary:
             passes["list"] = round(simulation.method.list_seconds / taken * per_segment, 2)
         result: dict[str, Any] = {
             "outcome": outcome,
-            "final": job.last_row,
+            "final": job.record.last_row,
             "counts": {
                 "fibers": model.fiber_count,
                 "nodes": model.node_count,
@@ -121,13 +122,18 @@ class Summary:
             "precision": simulation.scene.numerics.precision,
             "placement": simulation.placement_report,
             "hash": simulation.scene.hash,
+            "scene_path": str(Path(simulation.scene.path).resolve()),
             "versions": versions(),
         }
         if self.half_turns:
-            flow = simulation.scene.flow
-            rate = flow.rate if flow else 1.0
             result["half_turn_strain"] = self.half_turns
-            result["period"] = 2.0 * self.half_turns[0] / rate
+            flow = simulation.scene.flow
+            if flow is not None and not flow.schedule:
+                first = self.half_turns[0]
+                result["period_from_first_half_turn"] = 2.0 * first / flow.rate
+                if len(self.half_turns) > 1:
+                    second = self.half_turns[1] - first
+                    result["period_from_second_half_turn"] = 2.0 * second / flow.rate
         if self.failure is not None:
             result["failure"] = self.failure
         return result

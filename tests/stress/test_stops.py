@@ -16,6 +16,7 @@ import pytest
 from tests.stress.small_cell import CELL, Shell, shell
 from warpfiber import job as job_module
 from warpfiber.output import TrajectoryReader, checkpoint_paths, read_checkpoint
+from warpfiber.output.scalars import ScalarsWriter
 from warpfiber.stopping import Stopper
 
 __all__ = ["shell"]  # a fixture
@@ -46,12 +47,12 @@ def _stop_after(monkeypatch: pytest.MonkeyPatch, steps: int, reason: str = "SIGT
     jobs: list[job_module.Job] = []
     run = job_module.Job.run
 
-    def watched(job: job_module.Job, **options: float | None) -> int:
+    def watched(job: job_module.Job, stopper: Stopper | None = None) -> int:
+        del stopper  # the command line's own
         jobs.append(job)
-        return run(job, **options)
+        return run(job, Counted())
 
     monkeypatch.setattr(job_module.Job, "run", watched)
-    monkeypatch.setattr(job_module, "Stopper", Counted)
     monkeypatch.setattr(job_module, "LOOK_EVERY", 0.0)  # a look after every step
 
 
@@ -153,7 +154,7 @@ def test_a_kill_between_checkpoint_and_row_writes_no_row_twice(
         pass
 
     written: list[int] = []
-    append = job_module.ScalarsWriter.append
+    append = ScalarsWriter.append
 
     def counted(writer: object, row: dict[str, float]) -> None:
         append(writer, row)  # type: ignore[arg-type]
@@ -162,7 +163,7 @@ def test_a_kill_between_checkpoint_and_row_writes_no_row_twice(
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(job_module.ScalarsWriter, "append", counted)
+        patch.setattr(ScalarsWriter, "append", counted)
         # nothing that an orderly stop writes
         patch.setattr(job_module, "LOOK_EVERY", 0.0)
         with pytest.raises(Killed):

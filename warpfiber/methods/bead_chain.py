@@ -17,15 +17,16 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
-from warpfiber.methods.box_limits import smallest_sheared_height, strain_limit
+from warpfiber.methods.box_limits import bearable_strain
 from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Executor, Launch
-from warpfiber.passes.measure import TERMS, make_measure_terms
+from warpfiber.passes.measure import TERMS
+from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
+from warpfiber.passes.nodes import TEAR_STRETCH, NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
-from warpfiber.scene import Fault, Scene, SceneError
+from warpfiber.scene import Scene
 
 # Below this many segments the hand-off between workers costs more than it saves.
 WORKER_BREAK_EVEN = 5000
@@ -79,7 +80,7 @@ class BeadChain:
                 reach=contact_reach(scene) * 2.0 * largest,
                 skin=skin,
                 longest_rest=longest,
-                stretch=self._largest_stretch(),
+                stretch=float(self._segment_stretch().max()),
             )
             self.check_box()
         self._allocate_pair_results()
@@ -93,38 +94,25 @@ class BeadChain:
             return workers
         if self.model.segment_count < WORKER_BREAK_EVEN:
             return 1
-        return min(2, len(os.sched_getaffinity(0)))
+        try:
+            cores = len(os.sched_getaffinity(0))
+        except AttributeError:  # only Linux tells which cores this process may use
+            cores = os.cpu_count() or 1
+        return min(2, cores)
 
-    def _largest_stretch(self) -> float:
-        """Longest segment now, in its rest lengths."""
+    def _segment_stretch(self) -> np.ndarray:
+        """(S,) length of every segment now, in its rest length."""
         model = self.model
         nodes = self.state.node_pos.numpy().astype(float)
         first = model.host["segment_node"]
         rest = np.asarray([row["rest"] for row in model.group_rows])
         mine = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
-        return float((np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine).max())
+        lengths: np.ndarray = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine
+        return lengths
 
     def check_box(self) -> None:
         """Find the strain the box can bear; raises SceneError if it is too small from the start."""
-        assert self.list is not None
-        domain, width = self.model.domain, self.list.cell_width
-        size = np.asarray(domain.size)
-        smallest = min(
-            (edge for edge, wraps in zip(size, domain.periodic, strict=True) if wraps),
-            default=math.inf,
-        )
-        if domain.shear_axes is not None:
-            smallest = smallest_sheared_height(size, domain.shear_axes)
-        elif domain.sheared:
-            self.strain_end = strain_limit(size, self.full_gradient, self.flow_rate, width)
-        if smallest < width:
-            length = self.model.units.length
-            remedy = (
-                f"a periodic box must be {width * length:.4g} m high everywhere (longest segment + "
-                "reach + skin, shear included); enlarge it or take more segments"
-            )
-            edges = [float(edge) * length for edge in size]
-            raise SceneError([Fault(self.scene.path, "box.size", edges, remedy)])
+        self.strain_end = bearable_strain(self.scene, self.box_width * self.model.units.length)
 
     @property
     def box_width(self) -> float:
@@ -232,7 +220,7 @@ class BeadChain:
         features = NodeFeatures(
             closure=closure,
             pairs=self.pair_features.storage if pairs is not None else "none",
-            walls=model.domain.wall,
+            walls=model.domain.wall if self.strength > 0.0 else (False, False, False),
             gravity=self.scene.gravity is not None,
         )
         low = np.asarray(model.domain.low)
@@ -273,6 +261,13 @@ class BeadChain:
             split=True,
         )
 
+    def set_stretch(self, stretch: float) -> None:
+        """Take over the stretch that a saved run's list allowed; the next list and step use it."""
+        assert self.list is not None
+        self.list.set_stretch(stretch)
+        self.check_box()
+        self._stop_executor()
+
     def time_passes(self, steps: int) -> dict[str, float]:
         """Seconds per step of every launch and of the list, over `steps` steps of the run."""
         self.prepare()
@@ -312,9 +307,8 @@ class BeadChain:
             if torn:
                 return False
             if stretched and self.list is not None:
-                self.list.allow_stretch(STRETCH_GROWTH)
-                self.check_box()
-                self._stop_executor()
+                self.set_stretch(STRETCH_GROWTH * self.list.stretch_allowed)
+                self.state.status.zero_()
             if expired or stretched:
                 self.refresh_list()
         return True
@@ -346,43 +340,24 @@ class BeadChain:
     # -- what went wrong --------------------------------------------------------------------------
 
     def torn_fiber(self) -> dict[str, Any]:
-        """Fiber, its first bad node, and its largest force term (N) after a failed `advance`."""
+        """First torn fiber, its worst node, and its largest force term (N) after `advance`."""
         model, state = self.model, self.state
+        stretch = self._segment_stretch()
+        bad = np.flatnonzero(~(stretch < TEAR_STRETCH))
         fiber = int(state.status.numpy()[BAD_FIBER])
-        terms = wp.zeros(len(TERMS), dtype=wp.float64, device=model.device)
-        features = "pairs" if self.list is not None else "none"
-        pairs = self.list
-        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
-        wp.launch(
-            make_measure_terms(model.precision.name, features),
-            dim=1,
-            inputs=[
-                fiber,
-                model.precision.vec3(*self.flow_origin),
-                model.groups,
-                model.fiber_node_start,
-                model.fiber_group,
-                state.gradient,
-                state.node_pos,
-                state.node_velocity,
-                pairs.out_start if pairs else none_i,
-                pairs.in_start if pairs else none_i,
-                pairs.in_pair if pairs else none_i,
-                self.pair_force,
-                terms,
-            ],
-            device=model.device,
+        if len(bad):  # several may have torn in one step, in any order
+            fiber = int(model.host["segment_fiber"][bad[0]])
+        sizes = measure_fiber_terms(
+            model, state, fiber, self.flow_origin, self.list, self.pair_force
         )
-        first, end = model.host["fiber_node_start"][fiber : fiber + 2]
-        nodes = state.node_pos.numpy()[first:end].astype(float)
-        rest = model.group_rows[model.host["fiber_group"][fiber]]["rest"]
-        length = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / rest
-        worst = int(np.argmax(np.where(np.isfinite(length), length, math.inf)))
-        sizes = terms.numpy() * model.units.force
+        mine = stretch[model.host["segment_fiber"] == fiber]
+        worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))
+        known = np.isfinite(sizes).any()
+        largest = int(np.argmax(np.where(np.isfinite(sizes), sizes, -1.0 if known else 0.0)))
         return {
             "fiber": fiber,
             "node": worst,
             "terms": dict(zip(TERMS, map(float, sizes), strict=True)),
-            "largest_term": TERMS[int(np.argmax(np.where(np.isfinite(sizes), sizes, math.inf)))],
-            "stretch": float(length[worst]),
+            "largest_term": TERMS[largest],
+            "stretch": float(mine[worst]),
         }

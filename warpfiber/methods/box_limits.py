@@ -12,6 +12,10 @@ import math
 
 import numpy as np
 
+from warpfiber.scene import Fault, Scene, SceneError
+
+LARGEST_STRAIN = 1000.0  # a box that bears this much is taken to bear any
+
 
 def box_heights(lattice: np.ndarray) -> np.ndarray:
     """(3,) distances of opposite faces of the box with the columns of `lattice` as edges."""
@@ -19,7 +23,35 @@ def box_heights(lattice: np.ndarray) -> np.ndarray:
     return heights
 
 
-def smallest_sheared_height(size: np.ndarray, axes: tuple[int, int]) -> float:
+def bearable_strain(scene: Scene, width: float) -> float:
+    """Strain up to which every height of the scene's box is at least `width` (m); inf if always.
+
+    Raises SceneError (box.size) if the box is too small from the start.
+    """
+    box, flow = scene.box, scene.flow
+    if box is None:
+        return math.inf
+    size = np.asarray(box.size)
+    wraps = [kind == "periodic" for kind in box.boundary]
+    smallest = min(size[wraps], default=math.inf)
+    end = math.inf
+    if all(wraps) and flow is not None and flow.rate > 0.0:
+        gradient = np.asarray(flow.velocity_gradient)
+        entries = np.argwhere(gradient != 0.0)
+        if len(entries) == 1 and entries[0][0] != entries[0][1]:
+            smallest = _smallest_sheared_height(size, (int(entries[0][0]), int(entries[0][1])))
+        else:
+            end = strain_limit(size, gradient, flow.rate, width)
+    if smallest < width:
+        remedy = (
+            f"a periodic box must be {width:.4g} m high everywhere (longest segment + reach + "
+            "skin, shear included); enlarge it or take more segments"
+        )
+        raise SceneError([Fault(scene.path, "box.size", list(box.size), remedy)])
+    return end
+
+
+def _smallest_sheared_height(size: np.ndarray, axes: tuple[int, int]) -> float:
     """Smallest height of a box that is reset at half a box of shear."""
     lattice = np.diag(size)
     lattice[axes[0], axes[1]] = 0.5 * size[axes[0]]
@@ -27,26 +59,29 @@ def smallest_sheared_height(size: np.ndarray, axes: tuple[int, int]) -> float:
 
 
 def strain_limit(size: np.ndarray, gradient: np.ndarray, rate: float, width: float) -> float:
-    """Strain at which the smallest height falls to `width`; inf if that does not happen by 1000.
+    """Strain at which the smallest height falls to `width`; inf if not by LARGEST_STRAIN.
 
     `gradient` (3, 3) 1/s and `rate` 1/s at factor 1; the lattice follows exp(gradient t).
     """
-    step = 1e-3
-    push = _exponential(gradient * (step / rate))
+    step, strain = 0.05, 0.0
     lattice = np.diag(size).astype(float)
-    for k in range(1_000_000):
-        if box_heights(lattice).min() < width:
-            return max(0.0, (k - 1) * step)
-        lattice = push @ lattice
-        if not np.isfinite(lattice).all() or np.abs(lattice).max() > 1e12 * size.max():
-            break
+    push = _exponential(gradient * (step / rate))
+    while strain < LARGEST_STRAIN:
+        after = push @ lattice
+        if box_heights(after).min() < width:
+            if step < 1e-4:
+                return strain
+            step *= 0.5
+            push = _exponential(gradient * (step / rate))
+            continue
+        lattice, strain = after, strain + step
     return math.inf
 
 
 def _exponential(matrix: np.ndarray) -> np.ndarray:
     """exp of a small matrix by its series."""
     term = total = np.eye(3)
-    for k in range(1, 12):
+    for k in range(1, 16):
         term = term @ matrix / k
         total = total + term
     return total

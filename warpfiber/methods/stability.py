@@ -164,7 +164,7 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
         ),
     ]
     contact = scene.contact
-    if contact.law == "exponential":
+    if contact.strength:  # walls push by it even without pairs
         steepness = contact.decay / (2.0 * a)
         stiffness = contact.strength * steepness * math.exp(contact.decay * CONTACT_OVERLAP / 2.0)
         limits.append(
@@ -183,10 +183,8 @@ def step_limits(scene: Scene) -> list[StepLimit]:
 
 
 def chosen_step(scene: Scene) -> float:
-    """dt in s: given, from the strain step, or `dt_fraction` of the smallest limit."""
+    """dt in s: given (or from the strain step), or `dt_fraction` of the smallest limit."""
     numerics = scene.numerics
     if numerics.dt is not None:
         return numerics.dt
-    if numerics.strain_step is not None and scene.flow is not None and scene.flow.rate > 0.0:
-        return numerics.strain_step / scene.flow.rate
     return numerics.dt_fraction * step_limits(scene)[0].dt

@@ -41,6 +41,7 @@ class ResultFolder:
 
         Raises SceneError (key --out) if `path` exists and `overwrite` is false, or if refused.
         """
+        cls.check(path, overwrite)
         name = Path(scene_name).name.removesuffix(".toml") or "run"
         chosen = Path("results") / name if path is None else Path(path)
         try:
@@ -60,6 +61,23 @@ class ResultFolder:
             remedy = f"the folder cannot be made ({fault.strerror or fault}); name another one"
             raise SceneError([Fault("command line", "--out", str(chosen), remedy)]) from fault
         return cls(chosen)
+
+    @classmethod
+    def check(cls, path: str | Path | None, overwrite: bool = False) -> None:
+        """Raise what `create` would raise of an existing or unwritable folder; writes nothing."""
+        chosen = Path("results") if path is None else Path(path)
+        remedy = ""
+        if path is not None and chosen.exists() and not (overwrite and chosen.is_dir()):
+            remedy = "this is a file; name another folder"
+            if chosen.is_dir():
+                remedy = "the folder exists; name another one or add --overwrite"
+        near = chosen
+        while not near.exists() and near != near.parent:
+            near = near.parent
+        if not remedy and not (near.is_dir() and os.access(near, os.W_OK | os.X_OK)):
+            remedy = f"no permission to write in {near}; name another folder"
+        if remedy:
+            raise SceneError([Fault("command line", "--out", str(chosen), remedy)])
 
     @classmethod
     def open(cls, path: str | Path) -> ResultFolder:

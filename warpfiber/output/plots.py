@@ -198,7 +198,8 @@ def _abscissa(table: Mapping[str, NDArray[Any]], column: str) -> tuple[str, NDAr
 
 def _references(run: _Run) -> dict[str, Table]:
     """Tables `reference/<scene name>*.csv` beside the scene file, by file name; may be empty."""
-    named = run.scene.get("path") or run.folder.read_summary().get("scene_path")
+    # the summary has the absolute path: a plot may be drawn from another folder
+    named = run.folder.read_summary().get("scene_path") or run.scene.get("path")
     found: dict[str, Table] = {}
     if not named:
         return found

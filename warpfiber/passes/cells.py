@@ -206,7 +206,6 @@ def make_list_kernels(name: str, features: ListFeatures):
 
     @wp.kernel(**options)
     def find_pairs(
-        offset: wp.int32,
         reach: real,
         row_capacity: wp.int32,
         lattice: wp.array(dtype=wp.mat33d),
@@ -226,7 +225,7 @@ def make_list_kernels(name: str, features: ListFeatures):
         row_image_out: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
     ):
-        k = wp.tid() + offset
+        k = wp.tid()
         h = lattice[0]
         d = cells[0]
         own = cell_of[k]
@@ -322,7 +321,6 @@ def make_list_kernels(name: str, features: ListFeatures):
 
     @wp.kernel(**options)
     def compact_rows(
-        offset: wp.int32,
         row_capacity: wp.int32,
         row_count: wp.array(dtype=wp.int32),
         row_end: wp.array(dtype=wp.int32),
@@ -331,7 +329,7 @@ def make_list_kernels(name: str, features: ListFeatures):
     ):
         if status[wp.static(OVERFLOW)] != 0:
             return
-        k = wp.tid() + offset
+        k = wp.tid()
         count = row_count[k]
         for m in range(count):
             slot_out[row_end[k] - count + m] = k * row_capacity + m

@@ -20,9 +20,11 @@ from warpfiber.passes.measure import (
     PAIR_SUMS,
     TENSOR,
     TENSOR4,
+    TERMS,
     MeasureFeatures,
     make_measure_fibers,
     make_measure_pairs,
+    make_measure_terms,
 )
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import TOUCHES, PairFeatures
@@ -180,3 +182,39 @@ class Measurement:
         fiber = self.model.host["segment_fiber"]
         keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
         return 2.0 * len(np.unique(keys, axis=0)) / self.model.fiber_count
+
+
+def measure_fiber_terms(
+    model: Model,
+    state: State,
+    fiber: int,
+    flow_origin: np.ndarray,
+    pairs: NeighborList | None,
+    pair_force: Any,
+) -> np.ndarray:
+    """Largest force of every term (TERMS) on one fiber, N; not finite where the state is not."""
+    p, device = model.precision, model.device
+    terms = wp.zeros(len(TERMS), dtype=wp.float64, device=device)
+    nothing = wp.zeros(0, dtype=wp.int32, device=device)
+    wp.launch(
+        make_measure_terms(p.name, "none" if pairs is None else "pairs"),
+        dim=1,
+        inputs=[
+            fiber,
+            p.vec3(*flow_origin),
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            state.gradient,
+            state.node_pos,
+            state.node_velocity,
+            pairs.out_start if pairs else nothing,
+            pairs.in_start if pairs else nothing,
+            pairs.in_pair if pairs else nothing,
+            pair_force,
+            terms,
+        ],
+        device=device,
+    )
+    sizes: np.ndarray = terms.numpy() * model.units.force
+    return sizes

@@ -31,6 +31,9 @@ from warpfiber.model import (
 from warpfiber.passes.cells import MAX_CELLS_PER_SEGMENT, ListFeatures, make_list_kernels
 from warpfiber.passes.executor import load_kernel
 
+FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
+CELL_SLACK = 1.02  # what a segment may grow in the step that outgrows the cells
+
 
 class NeighborList:
     """Half list of segment pairs nearer than `reach` + `skin` (run units).
@@ -54,7 +57,7 @@ class NeighborList:
         self.model, self.state = model, state
         self.reach, self.skin = reach, skin
         self.longest_rest = longest_rest
-        self.stretch_allowed = max(1.05, 1.02 * stretch)
+        self.stretch_allowed = max(FIRST_STRETCH, CELL_SLACK * stretch)
         self.row_capacity = row_capacity
         self.pair_capacity = pair_capacity or max(64, 4 * model.segment_count)
         self.build_count = 0
@@ -85,12 +88,7 @@ class NeighborList:
     @property
     def cell_width(self) -> float:
         """Width that holds a segment, its reach and the skin; a step may stretch a bit more."""
-        return 1.02 * self.stretch_allowed * self.longest_rest + self.reach + self.skin
-
-    def allow_stretch(self, factor: float) -> None:
-        """Widen the cells for longer segments; build the list before the next step."""
-        self.set_stretch(factor * self.stretch_allowed)
-        self.state.status.zero_()
+        return CELL_SLACK * self.stretch_allowed * self.longest_rest + self.reach + self.skin
 
     def set_stretch(self, stretch: float) -> None:
         """Cells that hold segments of this many rest lengths, from the next build on."""
@@ -119,11 +117,6 @@ class NeighborList:
     def pair_count(self) -> int:
         """Number of listed pairs."""
         return int(self.state.status.numpy()[PAIR_COUNT])
-
-    @property
-    def bytes(self) -> int:
-        """Memory of all arrays of the list."""
-        return sum(int(a.capacity) for a in vars(self).values() if isinstance(a, wp.array))
 
     def build(self, *, wrap: bool = True) -> bool:
         """Build from the current positions; True if pair arrays were replaced by larger ones."""
@@ -218,7 +211,6 @@ class NeighborList:
         launch(
             "find_pairs",
             segments,
-            0,
             model.precision.real(self.reach + self.skin),
             self.row_capacity,
             state.lattice,
@@ -243,7 +235,6 @@ class NeighborList:
         launch(
             "compact_rows",
             segments,
-            0,
             self.row_capacity,
             self.row_count,
             self.row_end,

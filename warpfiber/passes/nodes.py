@@ -244,8 +244,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
             status[wp.static(BAD_FIBER)] = fiber
             return
 
-        # Second walk: closure. `node_force_out` becomes the force per bead mass that moves the
-        # node.
+        # Second walk: closure. With `consistent`, `node_force_out` becomes A^-1 F^ND.
         if wp.static(is_consistent):
             y = node_force_out[first] * pivots[g.pivot_start]
             node_force_out[first] = y

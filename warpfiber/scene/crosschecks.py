@@ -13,6 +13,7 @@ from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
+from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
 HOPELESS_FRACTION = 0.9
@@ -63,6 +64,8 @@ def _check_flow(draft: Draft) -> None:
         trace = gradient[0][0] + gradient[1][1] + gradient[2][2]
         if largest == 0.0:
             draft.blame("flow.gradient", 'all entries are 0; use kind = "rest"')
+        elif strain_rate(gradient) <= 1e-12 * largest:
+            draft.blame("flow.gradient", "a rotation without strain; give one that deforms")
         elif abs(trace) > 1e-9 * largest:
             remedy = f"the diagonal sums to {number_text(trace)}; it must be 0 (incompressible)"
             draft.blame("flow.gradient", remedy)

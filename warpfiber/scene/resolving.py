@@ -206,17 +206,23 @@ def _segments(draft: Draft, group: Values, index: int, place: str, asked: float)
 def _resolve_contact(draft: Draft) -> None:
     """Default strength D_0 = 1000 eta rate a^2 of the thickest fibers."""
     contact = draft.contact
-    if contact["law"] != "exponential":
+    if contact["law"] != "exponential" and not draft.axes("wall"):
         contact["strength"], contact["decay"] = 0.0, 50.0
         return
+    if contact["law"] == "none":  # no pairs, but walls still hold
+        contact["decay"] = 50.0
     if contact["strength"] is not None or draft.is_given("contact.strength"):
         return
     flow = draft.flow_object
     if flow is None:
         return
     if flow.rate == 0.0:
-        place = "contact.strength"
-        draft.faults.add(place, None, 'missing: no flow rate to set it; give N, or law = "none"')
+        remedy = "missing: no flow rate to set it; give N"
+        if contact["law"] == "none":
+            remedy = 'missing: walls push by it; give N and law = "exponential"'
+        elif not draft.axes("wall"):
+            remedy += ', or law = "none"'
+        draft.faults.add("contact.strength", None, remedy)
         return
     diameters = [group["diameter"] for group in draft.fibers]
     if diameters and None not in diameters:

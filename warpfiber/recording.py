@@ -1,0 +1,107 @@
+"""The rows and frames of a run: what `[record]` asks for, written as it is measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from warpfiber.output.folder import ResultFolder
+from warpfiber.output.scalars import ScalarsWriter
+from warpfiber.output.trajectory import TrajectoryWriter
+from warpfiber.scene import Scene
+from warpfiber.simulation import Simulation
+
+
+class Recording:
+    """Open `scalars.csv` and `run.vtkhdf` of one run."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        simulation: Simulation,
+        scalars: ScalarsWriter,
+        trajectory: TrajectoryWriter | None,
+        last_row: Mapping[str, float],
+        frame_step: int,
+    ) -> None:
+        self.scene, self.simulation = scene, simulation
+        self.scalars, self.trajectory = scalars, trajectory
+        self.last_row = dict(last_row)
+        self.frame_step = frame_step  # step of the last frame, -1 before the first
+
+    @classmethod
+    def start(
+        cls,
+        scene: Scene,
+        simulation: Simulation,
+        folder: ResultFolder,
+        attrs: Mapping[str, Any],
+    ) -> Recording:
+        """New files; `attrs` go into the trajectory. Raises RecordError."""
+        scalars = ScalarsWriter(folder.scalars_path, list(simulation.measure()))
+        trajectory = None
+        if scene.record.trajectory:
+            trajectory = TrajectoryWriter(
+                folder.trajectory_path,
+                fiber_node_start=simulation.fiber_node_start,
+                fiber_group=simulation.model.host["fiber_group"],
+                scene_json=json.dumps(scene.as_dict()),
+                attrs=attrs,
+                node_fields=[f"node_{name}" for name in scene.record.node_fields],
+            )
+        return cls(scene, simulation, scalars, trajectory, {}, -1)
+
+    @classmethod
+    def reopen(
+        cls,
+        scene: Scene,
+        simulation: Simulation,
+        folder: ResultFolder,
+        last_row: Mapping[str, float],
+        frame_step: int,
+    ) -> Recording:
+        """The files of a stopped run, cut to the present step. Raises RecordError."""
+        step = simulation.step_count
+        scalars = ScalarsWriter.reopen(folder.scalars_path, step)
+        trajectory = None
+        if scene.record.trajectory:
+            trajectory = TrajectoryWriter.reopen(folder.trajectory_path, step)
+        return cls(scene, simulation, scalars, trajectory, last_row, frame_step)
+
+    @property
+    def row_step(self) -> int:
+        """Step of the last row, -1 before the first."""
+        return int(self.last_row.get("step", -1))
+
+    def write_row(self) -> dict[str, float]:
+        """Measure now and append the row."""
+        self.last_row = self.simulation.measure()
+        self.scalars.append(self.last_row)
+        return self.last_row
+
+    def write_frame(self) -> None:
+        """Append the present positions and what is measured of them."""
+        simulation = self.simulation
+        self.frame_step = simulation.step_count
+        if self.trajectory is None:
+            return
+        row = self.last_row if self.row_step == self.frame_step else simulation.measure()
+        fields = {}
+        if "velocity" in self.scene.record.node_fields:
+            fields["node_velocity"] = simulation.node_velocity
+        self.trajectory.append(
+            simulation.step_count,
+            simulation.time,
+            simulation.strain,
+            simulation.node_pos,
+            simulation.lattice,
+            fields,
+            {k: v for k, v in row.items() if k not in ("step", "time", "strain")},
+        )
+
+    def close(self) -> None:
+        """Close both files."""
+        self.scalars.close()
+        if self.trajectory is not None:
+            self.trajectory.close()
