@@ -1,0 +1,114 @@
+"""`Simulation` and `Job` from Python: stages, velocities, walls without pairs, records at ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import warpfiber as wf
+
+CELL = """
+[box]
+size = [1.5e-4, 1.5e-4, 1.5e-4]
+[flow]
+kind = "simple_shear"
+shear_rate = 100
+viscosity = 100
+[[fibers]]
+count = 20
+aspect_ratio = 8
+diameter = 1e-5
+density = 4e9
+youngs_modulus = 1e8
+[[stage]]
+kind = "flow"
+end_strain = 0.2
+[record]
+figures = false
+[numerics]
+method = "bead_chain"
+segments = 2
+"""
+
+
+def scene(tmp_path: Path, text: str = CELL, **overrides: Any) -> wf.Scene:
+    """The cell above with overrides, `__` for the dots of a key."""
+    path = tmp_path / "cell.toml"
+    path.write_text(text)
+    return wf.load_scene(path, {key.replace("__", "."): v for key, v in overrides.items()})
+
+
+def test_run_goes_through_all_stages(tmp_path: Path) -> None:
+    """A stage by strain, then one by time: the end is their sum to within one step."""
+    text = CELL.replace("[record]", '[[stage]]\nkind = "flow"\nend_time = 1e-3\n[record]')
+    simulation = wf.Simulation(scene(tmp_path, text))
+    simulation.run()
+    assert simulation.strain == pytest.approx(0.3, abs=2.5 * 100.0 * simulation.dt)
+
+
+def test_velocity_is_that_of_the_unwrapped_nodes(tmp_path: Path) -> None:
+    """One step moves the unwrapped nodes by dt times the new velocity, whatever their images."""
+    # gravity carries the fibers through the sheared faces
+    simulation = wf.Simulation(scene(tmp_path, gravity__acceleration=[0.0, 0.0, -20.0]))
+    simulation.run(until=6.0)
+    assert np.abs(simulation.state.fiber_image.numpy()[:, 2]).max() > 0
+    before = simulation.node_pos
+    simulation.step()
+    moved = (simulation.node_pos - before) / simulation.dt
+    scale = np.abs(moved).max()
+    np.testing.assert_allclose(simulation.node_velocity, moved, atol=1e-7 * scale)
+
+
+def test_walls_hold_without_pairs(tmp_path: Path) -> None:
+    """Gravity presses fibers of a cell without pair forces on the wall: none gets through it."""
+    simulation = wf.Simulation(
+        scene(
+            tmp_path,
+            contact__law="none",
+            box__boundary=["periodic", "periodic", "wall"],
+            gravity__acceleration=[0.0, 0.0, -5.0],
+        )
+    )
+    simulation.run(until=3.0)
+    height = simulation.node_pos[:, 2]
+    assert height.min() > 0.0
+    assert height.min() < 6e-6  # some lie on it
+
+
+def test_a_rotation_is_no_flow_that_deforms(tmp_path: Path) -> None:
+    """Its strain never grows: refused, with the key."""
+    gradient = [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
+    text = CELL.replace("simple_shear", "gradient").replace(
+        "shear_rate = 100", f"gradient = {gradient}"
+    )
+    with pytest.raises(wf.SceneError, match="flow.gradient"):
+        scene(tmp_path, text)
+
+
+def test_frames_and_ends_hold_their_own_values(tmp_path: Path) -> None:
+    """Frames between rows carry their own tensor; the last row and frame are the end state."""
+    job = wf.Job.start(
+        scene(tmp_path, record__frames=7, record__scalars=3, record__quantities=["orientation"]),
+        out=tmp_path / "run",
+    )
+    assert job.run() == 0
+    with wf.TrajectoryReader(job.folder.trajectory_path) as reader:
+        tensor = reader.values("a33_fiber")
+        for frame in range(reader.frame_count):
+            axis = np.asarray(reader.fiber_axis(frame), dtype=float)
+            assert tensor[frame] == pytest.approx(np.mean(axis[:, 2] ** 2), abs=1e-6)
+        assert reader.step[-1] == job.simulation.step_count
+    rows = wf.read_scalars(job.folder.scalars_path)
+    assert rows["step"][-1] == job.simulation.step_count
+
+
+def test_early_faults_come_together(tmp_path: Path) -> None:
+    """Device, dt and folder are checked before any fiber is placed, and reported at once."""
+    (tmp_path / "run").mkdir()
+    with pytest.raises(wf.SceneError) as found:
+        wf.Job.start(scene(tmp_path, numerics__dt=1.0), out=tmp_path / "run", device="cuda:77")
+    keys = {fault.key for fault in found.value.faults}
+    assert keys == {"numerics.device", "numerics.dt", "--out"}
