@@ -256,7 +256,7 @@ TOGETHER: list[tuple[dict[str, object], str, str]] = [
     (
         {"flow.kind": "rest", "stage": [{"kind": "flow", "end_time": 1}]},
         "contact.strength",
-        'give N, or law = "none"',
+        "give N",
     ),
     ({"fibers.0.node_file": "nodes.txt", "fibers.0.count": GONE, "fibers.0.aspect_ratio": GONE},
      "fibers.0.node_file", ".npz or .csv"),
