@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import tomllib
-from typing import Any
 
 import pytest
 
-from warpfiber.scene import Fault, SceneError, scene_from_dict
-
-GONE = object()
-"""Marks a key that a case removes."""
+from tests.scene_text import GONE, changed, faults_of
 
 BONDED_SPHERES = """
 [box]
@@ -51,49 +47,6 @@ repeat = 3
 method = "bonded_spheres"
 segments = 26
 """
-
-
-def cell() -> dict[str, Any]:
-    """Return the tables of a shear cell that loads."""
-    return {
-        "box": {"size": [5e-4, 5e-4, 5e-4], "boundary": ["periodic", "periodic", "wall"]},
-        "flow": {"kind": "simple_shear", "shear_rate": 100, "viscosity": 100},
-        "fibers": [
-            {
-                "aspect_ratio": 20,
-                "diameter": 1e-5,
-                "count": 10,
-                "density": 4e9,
-                "youngs_modulus": 3e10,
-            }
-        ],
-        "contact": {"lubrication": "paper"},
-        "stage": [{"kind": "flow", "end_strain": 60}],
-        "numerics": {"method": "bead_chain", "segments": 3},
-    }
-
-
-def changed(changes: dict[str, object]) -> dict[str, Any]:
-    """Return the tables of the cell with dotted keys changed or removed."""
-    tables = cell()
-    for key, value in changes.items():
-        *path, name = key.split(".")
-        node: Any = tables
-        for part in path:
-            node = node[int(part)] if isinstance(node, list) else node.setdefault(part, {})
-        if value is GONE:
-            del node[name]
-        else:
-            node[name] = value
-    return tables
-
-
-def faults_of(tables: dict[str, Any], **overrides: object) -> tuple[Fault, ...]:
-    """Return the faults of tables; fails if they load."""
-    keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    with pytest.raises(SceneError) as caught:
-        scene_from_dict(tables, "cell.toml", keys)
-    return caught.value.faults
 
 
 NOT_YET: list[tuple[dict[str, object], str]] = [

@@ -10,72 +10,9 @@ import tomllib
 
 import pytest
 
-from warpfiber.scene import Scene, scene_from_dict
+from tests.scene_text import ONE_FIBER, cell, fiber
 from warpfiber.scene import derived as dv
-
-SHEAR_CELL = """
-[box]
-size = [5e-4, 5e-4, 5e-4]
-boundary = ["periodic", "periodic", "wall"]
-[flow]
-kind = "simple_shear"
-shear_rate = 100
-viscosity = 100
-[[fibers]]
-aspect_ratio = 20
-diameter = 1e-5
-volume_fraction = 0.056
-density = 4e9
-youngs_modulus = 3.26e10
-[contact]
-lubrication = "paper"
-[[stage]]
-kind = "flow"
-end_strain = 60
-[record]
-quantities = ["orientation", "interactions"]
-[numerics]
-method = "bead_chain"
-segments = 3
-"""
-
-ONE_FIBER = """
-[flow]
-kind = "simple_shear"
-shear_rate = 100
-viscosity = 100
-[[fibers]]
-count = 1
-aspect_ratio = 50
-diameter = 1e-5
-density = 4e9
-youngs_modulus = 5e8
-orientation = "aligned"
-[contact]
-law = "none"
-[[stage]]
-kind = "flow"
-end_strain = 160
-[numerics]
-method = "bead_chain"
-segments = 49
-"""
-
-
-def read(text: str, **overrides: object) -> Scene:
-    """Return the scene of a TOML text; `a__b=1` overrides the key a.b."""
-    keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    return scene_from_dict(tomllib.loads(text), "scene.toml", keys)
-
-
-def cell(**overrides: object) -> Scene:
-    """Return the shear cell with overrides."""
-    return read(SHEAR_CELL, **overrides)
-
-
-def fiber(**overrides: object) -> Scene:
-    """Return the single fiber with overrides."""
-    return read(ONE_FIBER, **overrides)
+from warpfiber.scene import scene_from_dict
 
 
 def test_effective_stiffness_and_reynolds_number() -> None:

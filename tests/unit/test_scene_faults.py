@@ -5,62 +5,14 @@ Each case changes one thing in a scene that loads, so the fault list must be exa
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
+from tests.scene_text import GONE, cell_tables, changed, faults_of
 from warpfiber.scene import (
     Fault,
     SceneError,
     scene_from_dict,
 )
-
-GONE = object()
-"""Marks a key that a case removes."""
-
-
-def cell() -> dict[str, Any]:
-    """Return the tables of a shear cell that loads."""
-    return {
-        "box": {"size": [5e-4, 5e-4, 5e-4], "boundary": ["periodic", "periodic", "wall"]},
-        "flow": {"kind": "simple_shear", "shear_rate": 100, "viscosity": 100},
-        "fibers": [
-            {
-                "aspect_ratio": 20,
-                "diameter": 1e-5,
-                "count": 10,
-                "density": 4e9,
-                "youngs_modulus": 3e10,
-            }
-        ],
-        "contact": {"lubrication": "paper"},
-        "stage": [{"kind": "flow", "end_strain": 60}],
-        "numerics": {"method": "bead_chain", "segments": 3},
-    }
-
-
-def changed(changes: dict[str, object]) -> dict[str, Any]:
-    """Return the tables of the cell with dotted keys changed or removed."""
-    tables = cell()
-    for key, value in changes.items():
-        *path, name = key.split(".")
-        node: Any = tables
-        for part in path:
-            node = node[int(part)] if isinstance(node, list) else node.setdefault(part, {})
-        if value is GONE:
-            del node[name]
-        else:
-            node[name] = value
-    return tables
-
-
-def faults_of(tables: dict[str, Any], **overrides: object) -> tuple[Fault, ...]:
-    """Return the faults of tables; fails if they load."""
-    keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    with pytest.raises(SceneError) as caught:
-        scene_from_dict(tables, "cell.toml", keys)
-    return caught.value.faults
-
 
 VALUES: list[tuple[str, object, str, str]] = [
     # key, value, how the value is shown, a piece of the remedy
@@ -150,9 +102,9 @@ KEYS: list[tuple[dict[str, object], str, str]] = [
     ({"shear_rate": 5}, "shear_rate", "move it below [flow]"),
     ({"fibres": [{}]}, "fibres", "did you mean [[fibers]]?"),
     ({"foo": {"a": 1}}, "foo", "unknown table; known:"),
-    ({"fibers": cell()["fibers"][0]}, "fibers", "write the heading [[fibers]]"),
-    ({"flow": [cell()["flow"]]}, "flow", "write the heading [flow]"),
-    ({"numerics": [cell()["numerics"]]}, "numerics", "write the heading [numerics]"),
+    ({"fibers": cell_tables()["fibers"][0]}, "fibers", "write the heading [[fibers]]"),
+    ({"flow": [cell_tables()["flow"]]}, "flow", "write the heading [flow]"),
+    ({"numerics": [cell_tables()["numerics"]]}, "numerics", "write the heading [numerics]"),
     ({"fibers": []}, "fibers", "missing; add at least one [[fibers]]"),
     ({"stage": GONE}, "stage", "missing; add a [[stage]]"),
     ({"flow": GONE}, "flow", 'kind = "rest"'),

@@ -9,33 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.scene_text import SHEAR_CELL
 from warpfiber.scene import SceneError, load_scene, parse_override, scene_from_dict
-
-SHEAR_CELL = """
-[box]
-size = [5e-4, 5e-4, 5e-4]
-boundary = ["periodic", "periodic", "wall"]
-[flow]
-kind = "simple_shear"
-shear_rate = 100
-viscosity = 100
-[[fibers]]
-aspect_ratio = 20
-diameter = 1e-5
-volume_fraction = 0.056
-density = 4e9
-youngs_modulus = 3.26e10
-[contact]
-lubrication = "paper"
-[[stage]]
-kind = "flow"
-end_strain = 60
-[record]
-quantities = ["orientation", "interactions"]
-[numerics]
-method = "bead_chain"
-segments = 3
-"""
 
 
 def cell() -> dict[str, Any]:
