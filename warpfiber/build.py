@@ -93,7 +93,7 @@ def _domain(scene: Scene, placement: Placement, units: Units) -> Domain:
     return Domain((0.0, 0.0, 0.0), edges, periodic, wall, moving, shear_axes)  # type: ignore[arg-type]
 
 
-def _device_groups(rows: list[dict[str, Any]], p: Precision, device: str) -> tuple[Any, Any]:
+def device_groups(rows: list[dict[str, Any]], p: Precision, device: str) -> tuple[Any, Any]:
     """Group structs and the Thomas pivots they point into."""
     Group = group_struct(p.name)
     structs: list[Any] = []
@@ -168,7 +168,7 @@ def build(
     units = choose_units(scene)
     domain = _domain(scene, placement, units)
     rows = [_group_row(scene, group, units) for group in scene.fibers]
-    groups, pivots = _device_groups(rows, p, device)
+    groups, pivots = device_groups(rows, p, device)
     start = np.asarray(placement.fiber_node_start, dtype=np.int32)
     fiber_count, node_count = len(start) - 1, int(start[-1])
     segment_fiber = np.repeat(np.arange(fiber_count, dtype=np.int32), np.diff(start) - 1)

@@ -15,6 +15,7 @@ import pytest
 
 from tests.cell import Kind, straight_fiber
 from tests.reference import rigid
+from warpfiber.build import device_groups
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
@@ -173,3 +174,25 @@ def test_orbit_in_space(start: Start, closure: str) -> None:
         assert np.abs(axis / np.linalg.norm(axis) - p).max() < 2e-4
         inertia = max(inertia, np.abs(rigid.jeffery_orbit(p0, gradient, r_e, time) - p).max())
     assert inertia > 1.5e-3
+
+
+def test_without_torque_a_fiber_never_turns_over(start: Start) -> None:
+    """r_e is infinite without bead torque: along x it stays, from 45 degrees it only aligns.
+
+    With the torque the same stiff fibers of r_f = 10 pass -x at strain 22.8. Drag alone turns the
+    angle theta of a rigid fiber by -sin(theta)^2 per strain: cot(theta) grows by the strain.
+    Tolerance: that of the file for t_1 plus the time a start out of balance costs, Re.
+    """
+    kind = Kind(3, 3.0, modulus=1e4)
+    fibers = [
+        straight_fiber(kind, (1, 0, 0), (0, 0, 0)),
+        straight_fiber(kind, (1, 0, 1), (0, 0, 0)),
+    ]
+    sim = start([kind], fibers, flow=SHEAR, numerics={"dt": 2e-3})
+    rows = [dict(row, torque=0.0) for row in sim.model.group_rows]
+    sim.model.groups, sim.model.pivots = device_groups(rows, sim.model.precision, sim.device)
+    sim.run(until=60.0)
+    nodes = sim.node_pos.reshape(2, 4, 3)
+    axis = nodes[:, -1] - nodes[:, 0]
+    assert axis[0, 2] == 0.0 and axis[0, 0] > 0.0
+    assert axis[1, 0] / axis[1, 2] == pytest.approx(1.0 + 60.0, rel=1e-2)
