@@ -70,12 +70,19 @@ def test_walls_hold_without_pairs(tmp_path: Path) -> None:
             contact__law="none",
             box__boundary=["periodic", "periodic", "wall"],
             gravity__acceleration=[0.0, 0.0, -5.0],
+            record__quantities=["energy"],
         )
     )
     simulation.run(until=3.0)
     height = simulation.node_pos[:, 2]
     assert height.min() > 0.0
     assert height.min() < 6e-6  # some lie on it
+    # potential of the walls: D0 = 1000 eta rate a^2, G0 = 50, zero at 1.0005 a
+    y = np.minimum(height, 1.5e-4 - height) / 5e-6
+    potential = 2.5e-4 * 5e-6 / 50.0 * (np.exp(50.0 * (1.0 - y)) - np.exp(-50.0 * 0.0005))
+    expected = potential[y < 1.0005].sum()
+    assert expected > 0.0
+    assert simulation.measure()["energy_wall"] == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_rotation_is_no_flow_that_deforms(tmp_path: Path) -> None:

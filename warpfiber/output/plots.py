@@ -90,6 +90,7 @@ _FIGURES = (
             "energy_stretching": ("stretching", _GREEN),
             "energy_bending": ("bending", _ORANGE),
             "energy_repulsion": ("repulsion", _PURPLE),
+            "energy_wall": ("walls", _GRAY),
         },
         logarithmic=True,
     ),

@@ -37,6 +37,7 @@ FIBER_SUMS = (
     "energy_stretching",
     "energy_bending",
     "curvature",
+    "energy_wall",
 )
 FIBER_MAXIMA = ("axial_strain_max", "curvature_max")
 # The 15 different components of the symmetric fourth-order tensor.
@@ -54,6 +55,7 @@ class MeasureFeatures:
     orientation4: bool = False
     energy: bool = False
     curvature: bool = False
+    walls: tuple[bool, bool, bool] = (False, False, False)  # with energy: potential of the walls
 
 
 @cache
@@ -66,6 +68,33 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
     has_energy, has_curvature = features.energy, features.curvature
     has_tensor4 = features.orientation4
     first_tensor4 = len(FIBER_SUMS)
+    wall_x, wall_y, wall_z = features.walls
+    has_walls = features.energy and any(features.walls)
+    _, repulsion_energy = make_repulsion(name)
+    wall_range = real(RANGE)
+
+    @wp.func
+    def wall_energy(y: real, radius: real, strength: real, decay: real) -> wp.float64:
+        """Potential of one node at the distance y of a wall (law `wall`)."""
+        if y > wall_range * radius:
+            return wp.float64(0.0)
+        return wp.float64(repulsion_energy(strength, decay, y, radius))
+
+    @wp.func
+    def walls_energy(
+        x: vec3, radius: real, low: vec3, high: vec3, strength: real, decay: real
+    ) -> wp.float64:
+        energy = wp.float64(0.0)
+        for axis in range(3):
+            has_wall = wp.static(wall_x)
+            if axis == 1:
+                has_wall = wp.static(wall_y)
+            if axis == 2:
+                has_wall = wp.static(wall_z)
+            if has_wall:
+                energy += wall_energy(x[axis] - low[axis], radius, strength, decay)
+                energy += wall_energy(high[axis] - x[axis], radius, strength, decay)
+        return energy
 
     @wp.func
     def add_tensor(
@@ -102,6 +131,10 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
     def measure_fibers(
         chunks: wp.int32,
         fibers: wp.int32,
+        wall_low: vec3,
+        wall_high: vec3,
+        strength: real,
+        decay: real,
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -120,6 +153,11 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
             rest = wp.float64(g.rest)
             axis = wp.normalize(wp.vec3d(node_pos[first + g.segments] - node_pos[first]))
             add_tensor(chunk, 7, axis, wp.float64(1.0), sums_out)
+            if wp.static(has_walls):
+                for i in range(first, first + g.segments + 1):
+                    sums_out[chunk, 17] = sums_out[chunk, 17] + walls_energy(
+                        node_pos[i], g.radius, wall_low, wall_high, strength, decay
+                    )
             n0 = vec3(real(0.0), real(0.0), real(0.0))
             for k in range(g.segments):
                 edge = wp.vec3d(node_pos[first + k + 1] - node_pos[first + k])

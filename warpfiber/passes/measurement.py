@@ -91,14 +91,20 @@ class Measurement:
             orientation4="orientation4" in wanted,
             energy="energy" in wanted,
             curvature="curvature" in wanted,
+            walls=model.domain.wall if self.strength > 0.0 else (False, False, False),
         )
+        p, low = model.precision, np.asarray(model.domain.low)
         columns = len(FIBER_SUMS) + (len(TENSOR4) if features.orientation4 else 0)
         values, largest = self._sums(
-            make_measure_fibers(model.precision.name, features),
+            make_measure_fibers(p.name, features),
             columns,
             len(FIBER_MAXIMA),
             model.fiber_count,
             [
+                p.vec3(*low),
+                p.vec3(*(low + np.asarray(model.domain.size))),
+                p.real(self.strength),
+                p.real(self.decay),
                 model.groups,
                 model.fiber_node_start,
                 model.fiber_group,
@@ -121,8 +127,9 @@ class Measurement:
             row["curvature_mean"] = sums["curvature"] / sums["length"] / model.units.length
             row["curvature_max"] = largest[1] / model.units.length
         if features.energy:
-            for name in ("energy_kinetic", "energy_stretching", "energy_bending"):
-                row[name] = sums[name] * model.units.energy
+            names = ["energy_kinetic", "energy_stretching", "energy_bending"]
+            names += ["energy_wall"] if any(features.walls) else []
+            row |= {name: sums[name] * model.units.energy for name in names}
         return {name: float(value) for name, value in row.items()}
 
     def _pair_row(self, pairs: NeighborList | None) -> dict[str, float]:
