@@ -191,7 +191,9 @@ COLUMNS: dict[str, list[str]] = {
     "overlap": ["overlap_max", "overlap_mean"],
     "axial_strain": ["axial_strain_max"],
     "rotation": ["angle"],
-    "energy": ["energy_kinetic", "energy_stretching", "energy_bending", "energy_repulsion"],
+    "energy": [
+        f"energy_{kind}" for kind in ("kinetic", "stretching", "bending", "wall", "repulsion")
+    ],
 }
 
 
