@@ -124,8 +124,7 @@ def initial_velocity(scene: Scene, placement: Placement) -> np.ndarray:
         kind = group.initial_velocity
         if isinstance(kind, str):
             if kind == "flow" and scene.flow is not None:
-                factor = scene.flow.schedule[0][1] if scene.flow.schedule else 1.0
-                gradient = factor * np.asarray(scene.flow.velocity_gradient)
+                gradient = scene.flow.factor(0.0) * np.asarray(scene.flow.velocity_gradient)
                 away = placement.node_pos[mine] - np.asarray(scene.flow.origin)
                 velocity[mine] = away @ gradient.T
         elif kind is not None:

@@ -129,7 +129,7 @@ class BeadChain:
         schedule = scene.flow.schedule if scene.flow and scene.flow.schedule else ((0.0, 1.0),)
         self.schedule = np.asarray(schedule, dtype=np.float64)
         strain = float(self.state.strain.numpy()[0])
-        factor = np.interp(strain, self.schedule[:, 0], self.schedule[:, 1])
+        factor = scene.flow.factor(strain) if scene.flow else 1.0
         self.state.gradient.assign((full * factor)[None].astype(p.numpy))
 
     def _allocate_pair_results(self) -> None:

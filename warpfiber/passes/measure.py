@@ -18,13 +18,7 @@ from warpfiber.laws.repulsion import RANGE, make_repulsion
 from warpfiber.laws.stretching import make_stretching
 from warpfiber.laws.torque import make_torque
 from warpfiber.model import precision
-from warpfiber.passes.pairs import (
-    LUBRICATES,
-    REPELS,
-    TOUCHES,
-    PairFeatures,
-    make_pair_geometry,
-)
+from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
 
 # Columns of the partial sums over fibers.
@@ -205,7 +199,7 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
 
 @cache
 def make_measure_pairs(name: str, features: PairFeatures):
-    """Kernel: partial sums over listed pairs (PAIR_SUMS), largest overlap, bits of every pair."""
+    """Kernel: partial sums over listed pairs (PAIR_SUMS), largest overlap, which pairs touch."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Group = group_struct(name)
@@ -231,7 +225,7 @@ def make_measure_pairs(name: str, features: PairFeatures):
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
-        pair_bits_out: wp.array(dtype=wp.int32),
+        pair_touches_out: wp.array(dtype=wp.int32),
         sums_out: wp.array2d(dtype=wp.float64),
         maxima_out: wp.array2d(dtype=wp.float64),
     ):
@@ -260,7 +254,7 @@ def make_measure_pairs(name: str, features: PairFeatures):
                 c = delta + st[1] * b - st[0] * a
                 distance = wp.length(c)
                 contact = gi.radius + gj.radius
-                bits = wp.int32(0)
+                touches = wp.int32(0)
                 if distance <= reach * contact:
                     overlap = wp.float64(wp.max(contact - distance, real(0.0)))
                     overlap = overlap / (wp.float64(contact) * wp.float64(0.5))
@@ -269,11 +263,10 @@ def make_measure_pairs(name: str, features: PairFeatures):
                         st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
                     ):
                         if distance <= contact:
-                            bits |= wp.static(TOUCHES)
+                            touches = 1
                             sums_out[chunk, 0] = sums_out[chunk, 0] + one
                             sums_out[chunk, 3] = sums_out[chunk, 3] + overlap
                         if wp.static(has_repulsion):
-                            bits |= wp.static(REPELS)
                             sums_out[chunk, 1] = sums_out[chunk, 1] + one
                             sums_out[chunk, 4] = sums_out[chunk, 4] + wp.float64(
                                 repulsion_energy(strength, decay, distance, contact)
@@ -283,9 +276,8 @@ def make_measure_pairs(name: str, features: PairFeatures):
                         gi, gj, at_i, at_j, delta, a, b, still, still, still, still, real(0.0)
                     )
                     if active > 0:
-                        bits |= wp.static(LUBRICATES)
                         sums_out[chunk, 2] = sums_out[chunk, 2] + one
-                pair_bits_out[k] = bits
+                pair_touches_out[k] = touches
 
     return measure_pairs
 

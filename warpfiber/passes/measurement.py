@@ -27,7 +27,7 @@ from warpfiber.passes.measure import (
     make_measure_terms,
 )
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.passes.pairs import TOUCHES, PairFeatures
+from warpfiber.passes.pairs import PairFeatures
 
 CHUNKS = 256
 PAIR_QUANTITIES = {"contacts", "interactions", "overlap"}
@@ -138,12 +138,12 @@ class Measurement:
         largest = 0.0
         coordination = 0.0
         if pairs is not None:
-            bits = wp.zeros(pairs.pair_capacity, dtype=wp.int32, device=model.device)
-            values, maxima = self._pair_sums(pairs, bits)
+            touches = wp.zeros(pairs.pair_capacity, dtype=wp.int32, device=model.device)
+            values, maxima = self._pair_sums(pairs, touches)
             sums = dict(zip(PAIR_SUMS, map(float, values), strict=True))
             largest = float(maxima[0])
             if "contacts" in wanted:
-                coordination = self._coordination(pairs, bits.numpy())
+                coordination = self._coordination(pairs, touches.numpy())
         fibers = model.fiber_count
         row: dict[str, float] = {}
         if "interactions" in wanted:
@@ -158,7 +158,7 @@ class Measurement:
             row["energy_repulsion"] = sums["energy_repulsion"] * model.units.energy
         return row
 
-    def _pair_sums(self, pairs: NeighborList, bits: Any) -> Any:
+    def _pair_sums(self, pairs: NeighborList, touches: Any) -> Any:
         model, state, p = self.model, self.state, self.model.precision
         return self._sums(
             make_measure_pairs(p.name, self.pair_features),
@@ -178,14 +178,14 @@ class Measurement:
                 pairs.pair_j,
                 pairs.pair_image,
                 state.node_pos,
-                bits,
+                touches,
             ],
         )
 
-    def _coordination(self, pairs: NeighborList, bits: np.ndarray) -> float:
+    def _coordination(self, pairs: NeighborList, touches: np.ndarray) -> float:
         """Mean number of distinct fibers (images apart) that a fiber touches."""
         i, j, image = pairs.host_pairs()
-        touching = (bits[: len(i)] & TOUCHES) != 0
+        touching = touches[: len(i)] != 0
         fiber = self.model.host["segment_fiber"]
         keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
         return 2.0 * len(np.unique(keys, axis=0)) / self.model.fiber_count

@@ -22,7 +22,6 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.precision import group_struct
 
 IMAGE_BITS = 10  # per axis, offset by half: images -512 ... 511
-TOUCHES, REPELS, LUBRICATES = 1, 2, 4  # bits of the pair measurement
 # How near a fraction counts as the end of a segment: where two fibers cross exactly at a node,
 # rounding would otherwise make neither or both of the two segments report the contact.
 END_TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
