@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import warpfiber as wf
+from warpfiber.model import STRETCHED
 
 CELL = """
 [box]
@@ -119,3 +120,19 @@ def test_early_faults_come_together(tmp_path: Path) -> None:
         wf.Job.start(scene(tmp_path, numerics__dt=1.0), out=tmp_path / "run", device="cuda:77")
     keys = {fault.key for fault in found.value.faults}
     assert keys == {"numerics.device", "numerics.dt", "--out"}
+
+
+def test_timing_passes_leaves_nothing_pending(tmp_path: Path) -> None:
+    """What a timed step asks for is done before a checkpoint could be taken without it."""
+    simulation = wf.Simulation(scene(tmp_path))
+    simulation.step()
+    pairs = simulation.method.list
+    assert pairs is not None
+    allowed, builds = pairs.stretch_allowed, pairs.build_count
+    status = simulation.state.status.numpy()
+    status[STRETCHED] = 1
+    simulation.state.status.assign(status)
+    simulation.pass_times(1)
+    assert pairs.stretch_allowed > allowed
+    assert pairs.build_count == builds + 1
+    assert simulation.state.status.numpy()[STRETCHED] == 0

@@ -273,8 +273,7 @@ class BeadChain:
         self.prepare()
         assert self.executor is not None
         times = self.executor.time_launches(steps, self._halted)
-        if self._halted() and self.state.status.numpy()[EXPIRED]:
-            self.refresh_list()
+        self._settle()  # a torn fiber is left to the next `advance`
         return times
 
     def refresh_list(self, *, wrap: bool = True) -> None:
@@ -302,15 +301,21 @@ class BeadChain:
             self.prepare()
             assert self.executor is not None
             self.executor.run(target - self.step_count, self._halted)
-            status = self._status()
-            torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
-            if torn:
+            if not self._settle():
                 return False
-            if stretched and self.list is not None:
-                self.set_stretch(STRETCH_GROWTH * self.list.stretch_allowed)
-                self.state.status.zero_()
-            if expired or stretched:
-                self.refresh_list()
+        return True
+
+    def _settle(self) -> bool:
+        """Do what halted the steps asks for, so that nothing is pending; False if a fiber tore."""
+        status = self._status()
+        torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
+        if torn:
+            return False
+        if stretched and self.list is not None:
+            self.set_stretch(STRETCH_GROWTH * self.list.stretch_allowed)
+            self.state.status.zero_()
+        if expired or stretched:
+            self.refresh_list()
         return True
 
     def _halted(self) -> bool:

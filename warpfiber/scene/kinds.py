@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,20 +21,20 @@ class KindError(ValueError):
     """What is wrong with one value and what to write instead."""
 
 
-class Kind:
+class Kind(ABC):
     """A kind of value; the subclasses are the whole list of kinds."""
 
+    @abstractmethod
     def words(self) -> str:
         """Return what is allowed, fit for "give ..."."""
-        raise NotImplementedError
 
+    @abstractmethod
     def fits(self, value: object) -> bool:
         """Tell whether the value looks meant for this kind, so that `Either` can choose."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read(self, value: object) -> Any:
         """Return the clean value; raises `KindError`."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
