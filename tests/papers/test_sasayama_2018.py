@@ -96,19 +96,13 @@ def tip_curve(segments: int, closure: str, fraction: float, strains: np.ndarray)
     ("segments", "closure"), [(49, "consistent"), (25, "consistent"), (25, "paper")]
 )
 def test_flexible_fiber_at_half_the_stable_step(segments: int, closure: str) -> None:
-    """Fig. 5a: z within 1e-3 L of the restatement (RK4, dt 2e-3) to strain 60.
-
-    x, which the figure does not show, peaks at 1.02e-3 in the fastest part of the turn for 25
-    segments with `paper`, whose limit is the largest, and halves with dt.
-    """
+    """Fig. 5a: tip within 1e-3 L of the restatement (RK4, dt 2e-3) to strain 60."""
     chain = flexible_chain(50, segments, 5e4, closure)
     run = run_flexible(chain, dt=2e-3, strain_end=60.0)
     strains = np.arange(1.0, 60.5, 1.0)
     expected = np.array([[run.at(run.tip[:, k], s) for k in (0, 2)] for s in strains])
     tips = tip_curve(segments, closure, 0.5, strains)
-    error = np.abs(tips - expected).max(axis=0)
-    assert error[1] < 1e-3
-    assert error[0] < 1.1e-3
+    assert np.abs(tips - expected).max() < 1e-3
 
 
 def test_reduced_flexible_fibers_agree_with_the_full_chain() -> None:

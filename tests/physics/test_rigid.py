@@ -1,7 +1,7 @@
 """Stiff fibers turn like the rigid line of beads, for every number of segments and closure.
 
 Source of the numbers: `tests.reference.rigid`, exact periods of the rigid chain with inertia.
-Tolerances: semi-implicit Euler is first order, and a fiber of finite E stretches. Relative error of
+Tolerances: the step is first order, and a fiber of finite E stretches. Relative error of
 t_1 for r_f = 10: -(22/E + 0.04 dt), of t_2 - t_1: at most 0.01 dt (measured at two E and two dt):
 the bounds 30/E + 0.05 dt and 0.02 dt.
 """

@@ -16,12 +16,16 @@ Start = Callable[..., Simulation]
 
 
 def is_stable(start: Start, kind: Kind, closure: str, dt: float) -> bool:
-    """Whether a slightly disturbed straight fiber in a fluid at rest calms down."""
+    """Whether a slightly disturbed straight fiber in a fluid at rest calms down.
+
+    It is disturbed more across than along: the line from the center to a middle node, which decides
+    over its published factors, shall not turn with the mode that grows.
+    """
     rng = np.random.default_rng(1)
     nodes = straight_fiber(kind, (1, 0, 0), (0, 0, 0))
     sim = start(
         [kind],
-        [nodes + 1e-7 * rng.normal(size=nodes.shape)],
+        [nodes + (1e-9, 1e-3, 1e-3) * rng.normal(size=nodes.shape)],
         velocity=np.zeros_like(nodes),
         numerics={"closure": closure, "dt": dt, "allow_unstable_dt": True},
     )
@@ -29,7 +33,7 @@ def is_stable(start: Start, kind: Kind, closure: str, dt: float) -> bool:
         sim.step(1500)
     except Diverged:
         return False
-    return bool(np.abs(sim.node_velocity).max() < 1e-4)
+    return bool(np.abs(sim.node_velocity).max() < 1e-4)  # 1e-3 and more if unstable
 
 
 CASES = [

@@ -302,6 +302,16 @@ def correct(force: Array, radial: Array, along: Array | float, across: Array | f
     return along_column * part + across_column * (force - part)
 
 
+def damping_share(chain: Chain, dt: float, beta: Array | float) -> Array:
+    """m / m*, the share of an explicit change of velocity that is left with the drag in the step.
+
+    m* = m + beta zeta dt / 2 (drag at the middle of the step) up to beta zeta dt = 2 m, from there
+    beta zeta dt; m for a negative beta.
+    """
+    gain = chain.drag * dt / chain.mass * np.maximum(beta, 0.0)
+    return 1.0 / np.where(gain < 2.0, 1.0 + 0.5 * gain, gain)
+
+
 def acceleration(
     chain: Chain,
     node_pos: Array,
@@ -309,23 +319,29 @@ def acceleration(
     gradient: Array,
     extra: Array | None = None,
     gravity: Sequence[float] | None = None,
+    dt: float = 0.0,
 ) -> Array:
-    """dv/dt (n, 3); `extra` F^P (n, 3) acts at nodes, `gravity` (3,) on every bead."""
+    """dv/dt (n, 3); `extra` F^P (n, 3) acts at nodes, `gravity` (3,) on every bead.
+
+    With `dt` the mean over a step that takes the drag implicitly.
+    """
     distributed = drag_force(chain, node_pos, node_vel, gradient)
     if gravity is not None:
         distributed = distributed + gravity_force(chain, gravity)
     nodal = nodal_force(chain, node_pos, node_vel, gradient, extra)
     if chain.closure == "none":
-        total = distributed + nodal
+        total = damping_share(chain, dt, 1.0) * (distributed + nodal)
     elif chain.closure == "consistent":
-        total = distributed + chain.inverse @ nodal
+        total = damping_share(chain, dt, 1.0) * (distributed + chain.inverse @ nodal)
     else:
         factors = paper_factors(chain, node_pos)
         arm = node_pos - node_pos.mean(axis=0)
         reach = np.sqrt(dot(arm, arm))[:, None]
         radial = arm / np.where(reach == 0.0, 1.0, reach)
-        total = correct(nodal, radial, factors.alpha_t, factors.alpha_r)
-        total += correct(distributed, radial, factors.beta_t, factors.beta_r)
+        along = damping_share(chain, dt, factors.beta_t)
+        across = damping_share(chain, dt, factors.beta_r)
+        total = correct(nodal, radial, along * factors.alpha_t, across * factors.alpha_r)
+        total += correct(distributed, radial, along * factors.beta_t, across * factors.beta_r)
     return total / chain.mass
 
 
@@ -346,6 +362,7 @@ def bending_energy(chain: Chain, node_pos: Array) -> float:
 
 
 Law = Callable[[Array, Array], Array]
+StepLaw = Callable[[Array, Array, float], Array]
 
 
 def step_rk4(law: Law, node_pos: Array, node_vel: Array, dt: float) -> tuple[Array, Array]:
@@ -364,12 +381,9 @@ def step_rk4(law: Law, node_pos: Array, node_vel: Array, dt: float) -> tuple[Arr
     )
 
 
-def step_semi_implicit(
-    law: Law, node_pos: Array, node_vel: Array, dt: float
+def step_drag_implicit(
+    law: StepLaw, node_pos: Array, node_vel: Array, dt: float
 ) -> tuple[Array, Array]:
-    """Semi-implicit Euler: v first, then x with the new v."""
-    new_vel = node_vel + dt * law(node_pos, node_vel)
+    """v first, by the mean acceleration law(x, v, dt) over the step, then x with the new v."""
+    new_vel = node_vel + dt * law(node_pos, node_vel, dt)
     return node_pos + dt * new_vel, new_vel
-
-
-STEPPERS = {"rk4": step_rk4, "semi_implicit": step_semi_implicit}

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from .bead_chain import (
-    STEPPERS,
     Array,
     Chain,
     acceleration,
     joint_angles,
     segment_geometry,
     shear_gradient,
+    step_rk4,
     straight_nodes,
 )
 from .rigid import hermite_root
@@ -50,7 +50,6 @@ def run_flexible(
     strain_end: float,
     rate: float = 1.0,
     sample: float = 0.1,
-    stepper: str = "rk4",
     start_with_flow: bool = False,
 ) -> FlexibleRun:
     """Shear u = (rate z, 0, 0), fiber along x about the origin, at rest or with v = u.
@@ -62,7 +61,6 @@ def run_flexible(
     if abs(per_sample * rate * dt - sample) > 1e-9 * sample:
         raise ValueError("sample is not a whole number of steps")
     gradient = shear_gradient(rate)
-    step = STEPPERS[stepper]
     x = straight_nodes(chain, (1, 0, 0), (0, 0, 0))
     v = x @ gradient.T if start_with_flow else np.zeros_like(x)
 
@@ -73,7 +71,7 @@ def run_flexible(
     frames = [x.copy()]
     for k in range(round(strain_end / sample) * per_sample):
         before, speed = x[-1] - x[0], v[-1] - v[0]
-        x, v = step(law, x, v, dt)
+        x, v = step_rk4(law, x, v, dt)
         after = x[-1] - x[0]
         if np.isnan(half) and after[0] < 0.0 and before[2] < 0.0 <= after[2]:
             slope = (v[-1] - v[0])[2]

@@ -106,40 +106,42 @@ def test_inertial_orbit_tends_to_jeffery() -> None:
     assert worst[0] / worst[1] == pytest.approx(5, rel=0.1)
 
 
-@pytest.mark.parametrize(("stepper", "order"), [("rk4", 4), ("semi_implicit", 1)])
-def test_stepper_order(stepper: str, order: int) -> None:
+def test_orders_of_the_steppers() -> None:
+    """Runge-Kutta 4; drag implicit: 1, from the torque and the first half step. Both +- 0.15."""
     chain = unit_chain("consistent")
 
-    def end(steps: int) -> np.ndarray:
-        x, v = UNIT_X, UNIT_V
-        for _ in range(steps):
-            x, v = bc.STEPPERS[stepper](
-                lambda y, u: bc.acceleration(chain, y, u, UNIT_GRADIENT), x, v, 0.2 / steps
-            )
-        return x
+    def law(x: np.ndarray, v: np.ndarray, dt: float = 0.0) -> np.ndarray:
+        return bc.acceleration(chain, x, v, UNIT_GRADIENT, dt=dt)
 
-    coarse, middle, fine = end(40), end(80), end(160)
-    ratio = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
-    assert math.log2(ratio) == pytest.approx(order, abs=0.15)
+    for stepper, order in ((bc.step_rk4, 4), (bc.step_drag_implicit, 1)):
+        ends = []
+        for steps in (40, 80, 160):
+            x, v = UNIT_X, UNIT_V
+            for _ in range(steps):
+                x, v = stepper(law, x, v, 0.2 / steps)
+            ends.append(x)
+        ratio = np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2])
+        assert math.log2(ratio) == pytest.approx(order, abs=0.15)
 
 
+@pytest.mark.parametrize("viscosity", [0.3, 300.0])
 @pytest.mark.parametrize("closure", ["none", "paper", "consistent"])
-def test_stability_limit_of_one_segment(closure: str) -> None:
-    """Semi-implicit Euler is stable iff omega^2 dt^2 + 2 c dt < 4."""
-    chain = bc.Chain(1, 19.0, closure=closure, modulus=5e4)
-    gain = {"none": 1.0, "paper": 2 / 20, "consistent": None}[closure]
-    if gain is None:
-        # Stretching mode (1, -1): A^-1 applied to it.
-        gain = 1 / (chain.matrix[0, 0] - chain.matrix[0, 1])
-    omega2 = 2 * gain * chain.stretching_stiffness / chain.mass
-    c = chain.drag / chain.mass
-    limit = (-c + math.sqrt(c * c + 4 * omega2)) / omega2
+def test_stability_limit_of_one_segment(closure: str, viscosity: float) -> None:
+    """Stable iff omega^2 dt^2 < 4 or, where drag rules, omega^2 dt < 2 c: the larger one."""
+    chain = bc.Chain(1, 19.0, closure=closure, modulus=5e4, viscosity=viscosity)
+    # Stretching mode (1, -1): A^-1 applied to it, and the drag of a node in beads.
+    alpha, beta = {"none": (1.0, 1.0), "paper": (2 / 20, 1.0), "consistent": (None, 1.0)}[closure]
+    if alpha is None:
+        alpha = 1 / (chain.matrix[0, 0] - chain.matrix[0, 1])
+    omega2 = 2 * alpha * chain.stretching_stiffness / chain.mass
+    limit = max(2.0 / math.sqrt(omega2), 2.0 * beta * chain.drag / chain.mass / omega2)
+    assert (viscosity > 1.0) == (limit > 2.0 / math.sqrt(omega2))  # which of the two it is
     for factor, stable in ((0.99, True), (1.01, False)):
         x = bc.straight_nodes(chain, (1, 0, 0), (0, 0, 0)) * (1 + 1e-9)
         v = np.zeros_like(x)
-        for _ in range(600):
-            x, v = bc.step_semi_implicit(
-                lambda y, u: bc.acceleration(chain, y, u, np.zeros((3, 3))),
+        for _ in range(1200):
+            x, v = bc.step_drag_implicit(
+                lambda y, u, dt: bc.acceleration(chain, y, u, np.zeros((3, 3)), dt=dt),
                 x,
                 v,
                 factor * limit,

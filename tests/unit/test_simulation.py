@@ -74,7 +74,7 @@ def test_walls_hold_without_pairs(tmp_path: Path) -> None:
             record__quantities=["energy"],
         )
     )
-    simulation.run(until=3.0)
+    simulation.run(until=4.0)
     height = simulation.node_pos[:, 2]
     assert height.min() > 0.0
     assert height.min() < 6e-6  # some lie on it

@@ -1,8 +1,9 @@
 """Explicit bead chain of Sasayama & Inagaki 2018, Eq. (16); N_R = 0 is their SBCM.
 
 A step: clock (time, flow, lattice), pair sweep (repulsion, lubrication), node sweep (gather, drag,
-stretching, bending, hydrodynamic torque, closure, semi-implicit Euler).
-Limits: first order in dt; dt below `stability.step_limits`.
+stretching, bending, hydrodynamic torque, closure; velocity first, with the drag at the middle of
+the step, then position).
+Limits: first order in dt (torque, first half step); dt below `stability.step_limits`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
 """Largest stable step of the explicit bead chain, term by term.
 
-Source: semi-implicit Euler (velocity first) of x'' = -w^2 x - c v is stable iff w^2 dt^2 + 2 c dt <
-    4. The modes are those of a straight fiber: axial (stretching against the closure's inertia and
-    drag) and transverse (bending, hydrodynamic torque). Contact: two touching beads with the
-    stiffness of the repulsion at an overlap of 0.1 a. Lubrication, where it is not limited: 2 m /
-    (2 c + zeta) at the inner end of its range, h = 0.001 a.
-Symbols: all SI; w^2 and c are per unit mass of a bead.
+Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
+    max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
+    4 max(m, dt Z / 2) - 2 dt C - dt^2 K is no longer positive. The modes are those of a straight
+    fiber: axial (stretching against the closure's inertia and drag) and transverse (bending,
+    hydrodynamic torque C). Contact: two touching beads with the stiffness of the repulsion at an
+    overlap of 0.1 a. Lubrication, where it is not limited: C of two beads at the inner end of its
+    range, h = 0.001 a. Flow: accuracy, not stability; a strain of 0.02.
+Symbols: all SI, per bead; matrices per node of a fiber.
 Limits: bent fibers and several contacts on one bead lower the true limit; `dt_fraction` covers
     them.
 """
@@ -20,9 +22,10 @@ import numpy as np
 from warpfiber.laws.closure import galerkin_entries
 from warpfiber.scene import FiberGroup, Scene
 
+Matrix = np.ndarray
 CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
-EXACT_NODES = 13  # fibers of up to so many nodes get the exact limit of their linear motion
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
+FLOW_STRAIN = 0.02  # largest strain of a step
 
 
 @dataclass(frozen=True)
@@ -34,15 +37,28 @@ class StepLimit:
     group: int
 
 
-def oscillator_limit(w2: float, c: float) -> float:
-    """Largest stable dt of one mode; inf for a mode without stiffness and damping."""
-    if w2 > 1e-300:
-        # the conjugate form has no cancellation when damping dominates
-        return 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
-    return 2.0 / c if c > 0.0 else math.inf
+def stable_limit(stiffness: Matrix, damping: Matrix, mass: Matrix, drag: Matrix) -> float:
+    """Largest stable step in s of symmetric matrices (n, n), by bisection; inf without a limit."""
+
+    def is_stable(dt: float) -> bool:
+        rest = 4.0 * np.maximum(mass, 0.5 * dt * drag) - 2.0 * dt * damping - dt * dt * stiffness
+        return bool(np.linalg.eigvalsh(rest)[0] > 0.0)
+
+    low, high = 1e-30, 1e30
+    if is_stable(high):
+        return math.inf
+    while high / low > 1.0 + 1e-6:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    return low
 
 
-def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[np.ndarray, ...]:
+def _bead_limit(stiffness: float, damping: float, mass: float, drag: float) -> float:
+    """The same for one bead, all in SI."""
+    return stable_limit(*(np.array([[value]]) for value in (stiffness, damping, mass, drag)))
+
+
+def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[Matrix, ...]:
     """Axial and transverse stiffness, torque damping and Galerkin matrix of a straight fiber."""
     n, a, m = group.segments, group.radius, group.bead_spacing
     rest = 2.0 * a * m
@@ -64,7 +80,7 @@ def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[np.ndarray, 
     return axial, bending, torque, galerkin
 
 
-def _published_closure(n: int, m: float) -> tuple[np.ndarray, ...]:
+def _published_closure(n: int, m: float) -> tuple[Matrix, ...]:
     """Inertia and drag of a straight fiber along and across it, in beads per node.
 
     m dv/dt = a F^ND + b F^D is the same as (m / a) dv/dt = F^ND + (b / a) F^D. Along: alpha^T and
@@ -87,54 +103,6 @@ def _published_closure(n: int, m: float) -> tuple[np.ndarray, ...]:
     return np.diag(1.0 / along), np.diag(drag_along), np.diag(1.0 / across), np.diag(drag_across)
 
 
-def _stable_limit(
-    stiffness: np.ndarray, damping: np.ndarray, inertia: np.ndarray, drag: np.ndarray, mass: float
-) -> float:
-    """Largest stable step of M x'' = -K x - C x': exact for few nodes, else mode by mode."""
-    limit = _slowest_mode_limit(stiffness, damping, inertia, drag, mass)
-    if len(stiffness) > EXACT_NODES or not 0.0 < limit < math.inf:
-        return limit
-    return _exact_limit(stiffness, damping + drag, mass * inertia, limit)
-
-
-def _exact_limit(
-    stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray, near: float
-) -> float:
-    """Step at which the amplification matrix gets an eigenvalue beyond 1, by bisection.
-
-    Where the damping of few nodes differs much (`paper`), the stiffness alone has other modes.
-    """
-    inverse = np.linalg.inv(mass)
-    k, c, eye = inverse @ stiffness, inverse @ damping, np.eye(len(mass))
-
-    def is_stable(dt: float) -> bool:
-        velocity = np.hstack([-dt * k, eye - dt * c])
-        position = np.hstack([eye, np.zeros_like(eye)]) + dt * velocity
-        step = np.vstack([position, velocity])
-        return bool(np.abs(np.linalg.eigvals(step)).max() < 1.0 + 1e-6)
-
-    low, high = near / 16.0, 16.0 * near
-    while high / low > 1.0 + 1e-4:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if is_stable(middle) else (low, middle)
-    return low
-
-
-def _slowest_mode_limit(
-    stiffness: np.ndarray, damping: np.ndarray, inertia: np.ndarray, drag: np.ndarray, mass: float
-) -> float:
-    """Smallest limit over the modes of `stiffness` against `inertia`, with damping and drag."""
-    root = np.linalg.cholesky(inertia)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ stiffness @ inverse.T)
-    modes = inverse.T @ vectors
-    limit = math.inf
-    for w2, mode in zip(values, modes.T, strict=True):
-        c = mode @ (damping + drag) @ mode
-        limit = min(limit, oscillator_limit(max(float(w2), 0.0) / mass, float(c) / mass))
-    return limit
-
-
 def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
     eta = scene.flow.viscosity if scene.flow else 0.0
@@ -154,25 +122,30 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     limits = [
         StepLimit(
             "stretching",
-            _stable_limit(axial, still, axial_inertia, zeta * axial_drag, mass),
+            stable_limit(axial, still, mass * axial_inertia, zeta * axial_drag),
             index,
         ),
         StepLimit(
             "bending and hydrodynamic torque",
-            _stable_limit(bending, torque, inertia, zeta * drag, mass),
+            stable_limit(bending, torque, mass * inertia, zeta * drag),
             index,
         ),
     ]
+    if scene.flow and scene.flow.velocity_gradient:
+        factors = [abs(factor) for _, factor in scene.flow.schedule or ((0.0, 1.0),)]
+        rate = np.abs(scene.flow.velocity_gradient).max() * max(factors)
+        if rate > 0.0:
+            limits.append(StepLimit("flow", FLOW_STRAIN / rate, index))
     contact = scene.contact
     if contact.strength:  # walls push by it even without pairs
         steepness = contact.decay / (2.0 * a)
         stiffness = contact.strength * steepness * math.exp(contact.decay * CONTACT_OVERLAP / 2.0)
-        limits.append(
-            StepLimit("contact", oscillator_limit(2.0 * stiffness / mass, zeta / mass), index)
-        )
+        limits.append(StepLimit("contact", _bead_limit(2.0 * stiffness, 0.0, mass, zeta), index))
     if contact.lubrication != "none" and scene.numerics.lubrication_step == "explicit":
         resistance = 1.5 * math.pi * eta * a**2 / (LUBRICATION_GAP * a)
-        limits.append(StepLimit("lubrication", 2.0 * mass / (2.0 * resistance + zeta), index))
+        limits.append(
+            StepLimit("lubrication", _bead_limit(0.0, 2.0 * resistance, mass, zeta), index)
+        )
     return limits
 
 

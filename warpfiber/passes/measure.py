@@ -289,7 +289,7 @@ def make_measure_terms(name: str, pairs: str):
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Group = group_struct(name)
     flow_velocity, flow_spin = make_flow(name)
-    drag_force = make_drag(name)
+    drag_force, _ = make_drag(name)
     torque_couple = make_torque(name)
     stretching_force = make_stretching(name)
     _, bending_forces = make_bending(name)

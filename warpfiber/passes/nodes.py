@@ -2,9 +2,9 @@
 
 One thread walks along one fiber. First walk: stretching, bending, hydrodynamic torque, walls and
 the gathered pair forces give the non-distributed force of every node. Second walk: the closure
-turns node forces into accelerations and the semi-implicit Euler step (velocity first, then position
-with the new velocity) moves the nodes. A fiber that is torn or not finite is left as it is and
-reported.
+turns node forces into accelerations and the step (velocity first, with the drag at the middle of
+the step, then position with the new velocity) moves the nodes. A fiber that is torn or not finite
+is left as it is and reported.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     flow_velocity, flow_spin = make_flow(name)
-    drag_force = make_drag(name)
+    drag_force, damped_mass = make_drag(name)
     torque_couple = make_torque(name)
     stretching_force = make_stretching(name)
     _, bending_forces = make_bending(name)
@@ -279,6 +279,9 @@ def make_node_sweep(name: str, features: NodeFeatures):
                 + two * g.radius * g.radius * n_seg * reduced * g.spacing * (two * reduced + one)
             )
 
+        half_drag = half * dt * g.drag
+        if wp.static(not is_paper):
+            kick = dt / damped_mass(g.mass, half_drag)
         affine = mat33(deformation[0])
         limit = skin_limit(affine, skin, list_reach)
         furthest = zero
@@ -304,12 +307,16 @@ def make_node_sweep(name: str, features: NodeFeatures):
                 if k == segments:
                     rotation = end_rotation_factor(g.spacing, n_seg, sum_last, n_before)
                 radial = x - center
-                force = split_force(force, radial, alpha_t, alpha_r)
                 translation = distributed_translation_factor(g.spacing, n_seg, is_end)
-                distributed = split_force(distributed, radial, translation, alpha_r * rotation)
+                rotation = alpha_r * rotation
+                along = dt / damped_mass(g.mass, half_drag * translation)
+                across = dt / damped_mass(g.mass, half_drag * rotation)
+                v += split_force(force, radial, along * alpha_t, across * alpha_r)
+                v += split_force(distributed, radial, along * translation, across * rotation)
                 partial += n_after
                 n_before = n_after
-            v = v + (dt / g.mass) * (distributed + force)
+            else:
+                v += kick * (distributed + force)
             x = x + dt * v
             node_velocity[i] = v
             node_pos[i] = x
