@@ -61,8 +61,8 @@ def test_momentum(start: Start) -> None:
 def test_energy(start: Start) -> None:
     """Kinetic + stretching + bending energy swings by O(dt) and does not drift.
 
-    Without drag the step is symplectic: over 40 periods of the slowest mode the largest error of the
-    second half is that of the first within 30 %, and half the dt gives half of it (0.4 to 0.6).
+    Without drag the step is symplectic: over 40 periods of the slowest mode the largest error of
+    the second half is that of the first within 30 %, and half the dt gives half of it (0.4 to 0.6).
     """
     nodes, velocity = moving_fiber()
     swings = []

@@ -19,14 +19,14 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.methods.box_limits import bearable_strain
+from warpfiber.methods.step_launches import step_launches
 from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
-from warpfiber.passes.clock import make_clock
-from warpfiber.passes.executor import Executor, Launch
+from warpfiber.passes.executor import Executor
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.passes.nodes import TEAR_STRETCH, NodeFeatures, make_node_sweep
-from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.nodes import TEAR_STRETCH
+from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
 
 # Below this many segments the hand-off between workers costs more than it saves.
@@ -137,130 +137,13 @@ class BeadChain:
         p, device = self.model.precision, self.model.device
         size = self.list.pair_capacity if self.list else 0
         arms = size if self.pair_features.storage == "arms" else 0
+        self.pair_acts = wp.zeros(size, dtype=wp.uint8, device=device)
         self.pair_force = wp.zeros(size, dtype=p.vec3, device=device)
         self.pair_closest = wp.zeros(size - arms, dtype=p.vec2, device=device)
         self.pair_arm_i = wp.zeros(arms, dtype=p.vec3, device=device)
         self.pair_arm_j = wp.zeros(arms, dtype=p.vec3, device=device)
 
     # -- the step ---------------------------------------------------------------------------------
-
-    def _launches(self) -> list[Launch]:
-        model, state, p = self.model, self.state, self.model.precision
-        name, domain = p.name, model.domain
-        scheduled = len(self.schedule) > 1
-        clock = make_clock(name, domain.sheared, scheduled)
-        launches = [
-            Launch(
-                "clock",
-                clock,
-                1,
-                [
-                    wp.float64(self.dt),
-                    wp.float64(self.flow_rate),
-                    wp.mat33d(*self.full_gradient.ravel()),
-                    wp.array(self.schedule, dtype=wp.vec2d, device=model.device),
-                    state.status,
-                    state.step,
-                    state.time,
-                    state.strain,
-                    state.gradient,
-                    state.lattice,
-                    state.lattice_now,
-                    state.deformation,
-                ],
-            )
-        ]
-        pairs = self.list
-        if pairs is not None:
-            launches.append(
-                Launch(
-                    "pairs",
-                    make_pair_sweep(name, self.pair_features),
-                    model.segment_count,
-                    [
-                        p.real(self._lubrication_dt()),
-                        p.real(self.strength),
-                        p.real(self.decay),
-                        model.groups,
-                        model.fiber_node_start,
-                        model.fiber_group,
-                        model.segment_node,
-                        model.segment_fiber,
-                        state.gradient,
-                        state.lattice_now,
-                        pairs.out_start,
-                        pairs.pair_j,
-                        pairs.pair_image,
-                        state.node_pos,
-                        state.node_velocity,
-                        state.status,
-                        self.pair_force,
-                        self.pair_closest,
-                        self.pair_arm_i,
-                        self.pair_arm_j,
-                    ],
-                    split=True,
-                )
-            )
-        launches.append(self._node_launch())
-        return launches
-
-    def _lubrication_dt(self) -> float:
-        """dt of the limited resistance; 0 leaves the published one.
-
-        Twice the step: a bead may have four partners at the smallest gap and still not be turned
-        round.
-        """
-        return 2.0 * self.dt if self.scene.numerics.lubrication_step == "limited" else 0.0
-
-    def _node_launch(self) -> Launch:
-        model, state, p, pairs = self.model, self.state, self.model.precision, self.list
-        closure = self.scene.numerics.closure
-        if all(abs(row["spacing"] - 1.0) < 1e-12 for row in model.group_rows):
-            closure = "none"  # every factor is 1 and A is the identity
-        features = NodeFeatures(
-            closure=closure,
-            pairs=self.pair_features.storage if pairs is not None else "none",
-            walls=model.domain.wall if self.strength > 0.0 else (False, False, False),
-            gravity=self.scene.gravity is not None,
-        )
-        low = np.asarray(model.domain.low)
-        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
-        return Launch(
-            "nodes",
-            make_node_sweep(p.name, features),
-            model.fiber_count,
-            [
-                p.real(self.dt),
-                p.vec3(*self.flow_origin),
-                p.vec3(*low),
-                p.vec3(*(low + np.asarray(model.domain.size))),
-                p.real(self.strength),
-                p.real(self.decay),
-                p.real(pairs.reach + pairs.skin if pairs else 0.0),
-                p.real(pairs.skin if pairs else 0.0),
-                p.real(pairs.stretch_allowed if pairs else 0.0),
-                model.groups,
-                model.pivots,
-                model.fiber_node_start,
-                model.fiber_group,
-                state.gradient,
-                state.deformation,
-                pairs.out_start if pairs else none_i,
-                pairs.in_start if pairs else none_i,
-                pairs.in_pair if pairs else none_i,
-                self.pair_force,
-                self.pair_closest,
-                self.pair_arm_i,
-                self.pair_arm_j,
-                state.list_pos,
-                state.node_pos,
-                state.node_velocity,
-                state.node_force,
-                state.status,
-            ],
-            split=True,
-        )
 
     def set_stretch(self, stretch: float) -> None:
         """Take over the stretch that a saved run's list allowed; the next list and step use it."""
@@ -293,7 +176,7 @@ class BeadChain:
         if self.list is not None and self.list.build_count == 0:
             self.refresh_list()
         if self.executor is None:
-            self.executor = Executor(self._launches(), self.model.device, self.workers)
+            self.executor = Executor(step_launches(self), self.model.device, self.workers)
 
     def advance(self, steps: int) -> bool:
         """Run up to `steps` steps, rebuilding the list where it expires; False if a fiber tore."""
@@ -354,7 +237,7 @@ class BeadChain:
         if len(bad):  # several may have torn in one step, in any order
             fiber = int(model.host["segment_fiber"][bad[0]])
         sizes = measure_fiber_terms(
-            model, state, fiber, self.flow_origin, self.list, self.pair_force
+            model, state, fiber, self.flow_origin, self.list, self.pair_acts, self.pair_force
         )
         mine = stretch[model.host["segment_fiber"] == fiber]
         worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))

@@ -314,6 +314,7 @@ def make_measure_terms(name: str, pairs: str):
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
+        pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         terms_out: wp.array(dtype=wp.float64),
     ):
@@ -341,9 +342,12 @@ def make_measure_terms(name: str, pairs: str):
                 if wp.static(has_pairs):
                     segment = i - fiber
                     for pair in range(out_start[segment], out_start[segment + 1]):
-                        keep_largest(3, pair_force[pair], terms_out)
+                        if pair_acts[pair] != wp.uint8(0):
+                            keep_largest(3, pair_force[pair], terms_out)
                     for slot in range(in_start[segment], in_start[segment + 1]):
-                        keep_largest(3, pair_force[in_pair[slot]], terms_out)
+                        pair = in_pair[slot]
+                        if pair_acts[pair] != wp.uint8(0):
+                            keep_largest(3, pair_force[pair], terms_out)
                 n0 = n1
                 d0 = d1
 

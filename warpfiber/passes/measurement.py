@@ -197,6 +197,7 @@ def measure_fiber_terms(
     fiber: int,
     flow_origin: np.ndarray,
     pairs: NeighborList | None,
+    pair_acts: Any,
     pair_force: Any,
 ) -> np.ndarray:
     """Largest force of every term (TERMS) on one fiber, N; not finite where the state is not."""
@@ -218,6 +219,7 @@ def measure_fiber_terms(
             pairs.out_start if pairs else nothing,
             pairs.in_start if pairs else nothing,
             pairs.in_pair if pairs else nothing,
+            pair_acts,
             pair_force,
             terms,
         ],

@@ -87,6 +87,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
+        pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         pair_closest: wp.array(dtype=vec2),
         pair_arm_i: wp.array(dtype=vec3),
@@ -96,20 +97,22 @@ def make_node_sweep(name: str, features: NodeFeatures):
         total = vec3(zero, zero, zero)
         second = vec3(zero, zero, zero)
         for k in range(out_start[segment], out_start[segment + 1]):
-            force = pair_force[k]
-            total += force
-            if wp.static(has_arms):
-                second += pair_arm_i[k]
-            else:
-                second += pair_closest[k][0] * force
+            if pair_acts[k] != wp.uint8(0):
+                force = pair_force[k]
+                total += force
+                if wp.static(has_arms):
+                    second += pair_arm_i[k]
+                else:
+                    second += pair_closest[k][0] * force
         for slot in range(in_start[segment], in_start[segment + 1]):
             k = in_pair[slot]
-            force = pair_force[k]
-            total -= force
-            if wp.static(has_arms):
-                second -= pair_arm_j[k]
-            else:
-                second -= pair_closest[k][1] * force
+            if pair_acts[k] != wp.uint8(0):
+                force = pair_force[k]
+                total -= force
+                if wp.static(has_arms):
+                    second -= pair_arm_j[k]
+                else:
+                    second -= pair_closest[k][1] * force
         return total, second
 
     @wp.func
@@ -151,6 +154,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
+        pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         pair_closest: wp.array(dtype=vec2),
         pair_arm_i: wp.array(dtype=vec3),
@@ -208,6 +212,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
                     out_start,
                     in_start,
                     in_pair,
+                    pair_acts,
                     pair_force,
                     pair_closest,
                     pair_arm_i,

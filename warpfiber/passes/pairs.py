@@ -1,8 +1,9 @@
 """One sweep over listed pairs: capsule repulsion and bead lubrication between two segments.
 
-One thread owns a segment and its outgoing pairs. It stores per pair the force on the owner and
-where it acts; the node sweep gathers, so nothing is added atomically and the result does not depend
-on the number of workers. `closest`: force and the fractions (s, t) of the one point pair. `arms`:
+One thread owns a segment and its outgoing pairs. It stores per pair whether it acts and, only then,
+the force on the owner and where it acts (a slot that does not act keeps stale values); the node
+sweep gathers, so nothing is added atomically and the result does not depend on the number of
+workers. `closest`: force and the fractions (s, t) of the one point pair. `arms`:
 several bead pairs act, so the sums of s F and t F are stored instead.
 
 Source: Sasayama & Inagaki 2018, Appendix A. Beads: a segment owns its first node and its inner
@@ -239,6 +240,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        pair_acts_out: wp.array(dtype=wp.uint8),
         pair_force_out: wp.array(dtype=vec3),
         pair_closest_out: wp.array(dtype=vec2),
         pair_arm_i_out: wp.array(dtype=vec3),
@@ -272,6 +274,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
             contact = gi.radius + gj.radius
             at_j = node_j - fiber_node_start[fiber_j]
             force = vec3(zero, zero, zero)
+            acts = wp.uint8(0)
             if wp.static(has_repulsion):
                 reach = repulsion_range * contact
                 if dd <= reach * reach:
@@ -283,6 +286,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
                         if dd == zero:
                             direction = wp.normalize(wp.cross(a, b))
                         force = -repulsion_size(strength, decay, distance, contact) * direction
+                        acts = wp.uint8(1)
             if wp.static(has_lubrication):
                 arm_i = st[0] * force
                 arm_j = st[1] * force
@@ -305,13 +309,18 @@ def make_pair_sweep(name: str, features: PairFeatures):
                         node_velocity[node_j + 1] + moving,
                         dt,
                     )
-                    force += squeeze
-                    arm_i += squeeze_i
-                    arm_j += squeeze_j
-                pair_arm_i_out[k] = arm_i
-                pair_arm_j_out[k] = arm_j
-            else:
+                    if active > 0:
+                        acts = wp.uint8(1)
+                        force += squeeze
+                        arm_i += squeeze_i
+                        arm_j += squeeze_j
+                if acts != wp.uint8(0):
+                    pair_arm_i_out[k] = arm_i
+                    pair_arm_j_out[k] = arm_j
+            elif acts != wp.uint8(0):
                 pair_closest_out[k] = st
-            pair_force_out[k] = force
+            pair_acts_out[k] = acts
+            if acts != wp.uint8(0):
+                pair_force_out[k] = force
 
     return pair_sweep
