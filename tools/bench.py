@@ -1,11 +1,12 @@
 """Benchmarks: time and error side by side, as JSON lines in tools/results/bench.jsonl.
 
     python tools/bench.py engine                  a dense cell: ns per segment-step of every pass
+    python tools/bench.py beads                   1000 fibers of 20 beads: bead-steps per second
     python tools/bench.py accuracy                one flexible fiber: run time against error
     python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
     python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds
-    options: --seeds N, --strain S, --device D, --workers W, --repeats N, --dry (print, do not
-    write)
+    options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
+    --workers W, --repeats N, --dry (print, do not write)
 
 A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
 compare only within one run of this tool.
@@ -15,18 +16,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import subprocess
+import resource
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from machine import ROOT, commit, processor
 
 import warpfiber as wf
+from warpfiber.methods.stability import chosen_step
 
-ROOT = Path(__file__).resolve().parent.parent
 SCENES = ROOT / "scenes" / "sasayama_2018"
 RESULTS = ROOT / "tools" / "results" / "bench.jsonl"
 
@@ -41,30 +41,6 @@ CELLS = {
     "flexible_rf20_vf056": 7,
     "flexible_rf30_vf037": 10,
 }
-
-
-def commit() -> str:
-    """Short hash of the tree, with + if it has changes."""
-    run = ["git", "-C", str(ROOT)]
-    try:
-        head = subprocess.run(
-            [*run, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        dirty = subprocess.run([*run, "diff", "--quiet", "HEAD"], check=False).returncode
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return head + ("+" if dirty else "")
-
-
-def processor() -> str:
-    """Name of the processor."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor()
 
 
 def common(simulation: wf.Simulation) -> dict[str, Any]:
@@ -114,42 +90,84 @@ def timed_steps(simulation: wf.Simulation, steps: int) -> tuple[float, float]:
 
 
 def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Cells of r_f = 50 fibers at V_f = 0.1, segments of 5 diameters, repulsion only."""
-    for precision in ("float64", "float32"):
+    """Cells of r_f = 50 fibers at V_f = 0.1, segments of 5 diameters, repulsion only.
+
+    The density is chosen so that half the stable step is the asked strain per step.
+    """
+    for precision in args.precisions:
         for fibers in args.fibers:
             edge = (2.0 * np.pi * 5e-6**3 * 50 * fibers / 0.1) ** (1 / 3)
-            scene = wf.load_scene(
-                SCENES / "shear_cell.toml",
-                {
-                    "box.size": [edge] * 3,
-                    "box.boundary": ["periodic"] * 3,
-                    "fibers.0.aspect_ratio": 51,
-                    "fibers.0.count": fibers,
-                    "contact.lubrication": "none",
-                    "numerics.segments": 10,
-                    "numerics.precision": precision,
-                    "numerics.dt_fraction": 0.5,
-                    "record.quantities": ["overlap"],
-                },
-            )
-            simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
-            simulation.step(200)
-            count = simulation.model.segment_count
-            whole, lists = [], []
-            for _ in range(args.repeats):
-                seconds, building = timed_steps(simulation, 100)
-                whole.append(seconds / 100 / count * 1e9)
-                lists.append(building / 100 / count * 1e9)
-            overlap = simulation.measure()["overlap_max"]
-            yield common(simulation) | {
-                "bench": "engine",
-                "ns_per_segment_step": round(float(np.median(whole)), 1),
-                "ns_list": round(float(np.median(lists)), 1),
-                "ns_by_pass": passes(simulation, 50),
-                "error": overlap,
-                "error_kind": "largest overlap, radii",
+            overrides = {
+                "box.size": [edge] * 3,
+                "box.boundary": ["periodic"] * 3,
+                "fibers.0.aspect_ratio": 51,
+                "fibers.0.count": fibers,
+                "contact.lubrication": "none",
+                "numerics.segments": 10,
+                "numerics.precision": precision,
+                "numerics.dt_fraction": 0.5,
+                "record.quantities": ["overlap"],
             }
-            simulation.close()
+            scene = wf.load_scene(SCENES / "shear_cell.toml", overrides)
+            dt, rate = chosen_step(scene), scene.flow.rate
+            overrides["fibers.0.density"] = 4e9 * (args.strain_step / (dt * rate)) ** 2
+            scene = wf.load_scene(SCENES / "shear_cell.toml", overrides)
+            yield cell_speed(scene, args) | {"bench": "engine"}
+
+
+def beads(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """1000 fibers of 20 beads, every bead a node: a sheared cell as molecular dynamics runs it."""
+    edge = (2.0 * np.pi * 5e-6**3 * 20 * 1000 / 0.1) ** (1 / 3)
+    for precision in args.precisions:
+        scene = wf.load_scene(
+            SCENES / "shear_cell.toml",
+            {
+                "box.size": [edge] * 3,
+                "box.boundary": ["periodic"] * 3,
+                "fibers.0.aspect_ratio": 20,
+                "fibers.0.count": 1000,
+                "contact.lubrication": "none",
+                "numerics.reduced_beads": 0,
+                "numerics.precision": precision,
+                "record.quantities": ["overlap"],
+            },
+        )
+        row = cell_speed(scene, args) | {"bench": "beads"}
+        ns = row["ns_per_segment_step"] * row["segment_count"] / 20_000
+        yield row | {"bead_steps_per_second": round(1e9 / ns, -3)}
+
+
+def cell_speed(scene: wf.Scene, args: argparse.Namespace) -> dict[str, Any]:
+    """Time of whole steps with list builds (median), by pass, and what the list looks like."""
+    begin = time.perf_counter()
+    simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+    placed = time.perf_counter() - begin
+    method, count = simulation.method, simulation.model.segment_count
+    steps = max(20, min(100, 4_000_000 // count))
+    simulation.step(2 * steps)
+    whole, lists, builds = [], [], method.list.build_count
+    for _ in range(args.repeats):
+        seconds, building = timed_steps(simulation, steps)
+        whole.append(seconds / steps / count * 1e9)
+        lists.append(building / steps / count * 1e9)
+    builds = method.list.build_count - builds
+    overlap = simulation.measure()["overlap_max"]
+    row = common(simulation) | {
+        "strain_per_step": round(simulation.dt * scene.flow.rate, 6),
+        "ns_per_segment_step": round(float(np.median(whole)), 1),
+        "ns_spread": [round(min(whole), 1), round(max(whole), 1)],
+        "us_per_step": round(float(np.median(whole)) * count * 1e-3, 1),
+        "ns_list": round(float(np.mean(lists)), 1),
+        "ns_per_build": round(sum(lists) * steps / max(1, builds), 1),
+        "steps_per_build": round(args.repeats * steps / max(1, builds), 1),
+        "ns_by_pass": passes(simulation, min(50, steps)),
+        "seconds_to_place": round(placed, 1),
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
+        "error": overlap,
+        "error_kind": "largest overlap, radii",
+    }
+    simulation.close()
+    return row
 
 
 def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -292,12 +310,14 @@ def suspension(scene: wf.Scene, args: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     """Run one benchmark and append its rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("bench", choices=["engine", "accuracy", "period", "suspensions"])
+    parser.add_argument("bench", choices=["engine", "beads", "accuracy", "period", "suspensions"])
     parser.add_argument("names", nargs="*", help="cells of `suspensions`")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--strain", type=float, default=60.0)
     parser.add_argument("--segments", type=int, nargs="*", help="0 = full chain")
     parser.add_argument("--fibers", type=int, nargs="*", default=[50, 2000])
+    parser.add_argument("--strain-step", type=float, default=1e-3, help="of `engine`")
+    parser.add_argument("--precisions", nargs="*", default=["float64", "float32"])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=7)

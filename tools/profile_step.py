@@ -1,0 +1,110 @@
+"""Where the time of a step goes: every pass of a scene, its memory traffic, and the neighbor list.
+
+    python tools/profile_step.py SCENE.toml [--set key=value] [--device D] [--steps N] [--warm N]
+
+Bytes: every array that a kernel reads or writes, once each, pair arrays up to the pairs in use: the
+least that must move. They are compared with a copy of as many bytes by one core (CPU only), so that
+a pass far below that bandwidth is bound by arithmetic or latency, not by memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from machine import commit, copy_bandwidth, processor
+
+import warpfiber as wf
+from warpfiber.scene import parse_override
+
+# Arguments that a kernel both reads and writes.
+BOTH_WAYS = {"node_pos", "node_velocity", "node_force_out", "status"}
+
+
+def bytes_moved(launch: Any, pairs: Any) -> int:
+    """Least traffic of one launch in bytes."""
+    total = 0
+    names = [argument.label for argument in launch.kernel.adj.args]
+    values = [0, *launch.inputs] if launch.split else launch.inputs
+    for name, value in zip(names, values, strict=True):
+        if not isinstance(value, wp.array):
+            continue
+        size = value.size * wp.types.type_size_in_bytes(value.dtype)
+        if pairs is not None and value.size in (pairs.pair_capacity, 2 * pairs.pair_capacity):
+            size = size * pairs.pair_count // value.size
+        total += size * (2 if name in BOTH_WAYS else 1)
+    return total
+
+
+def profile(args: argparse.Namespace) -> None:
+    """Run, measure and print."""
+    scene = wf.load_scene(args.scene, dict(args.set))
+    simulation = wf.Simulation(scene, device=args.device, workers=1)
+    method, count = simulation.method, simulation.model.segment_count
+    simulation.step(args.warm)
+    builds_before, seconds_before = list_state(method)
+    times = simulation.pass_times(args.steps)
+    simulation.step(args.steps)
+    steps = 2 * args.steps
+    builds, seconds = list_state(method)
+    builds, seconds = builds - builds_before, seconds - seconds_before
+    rows = [(launch.name, times[launch.name], launch) for launch in method.executor.launches]
+    whole = sum(times.values()) + seconds / steps
+    print(f"{scene.name}: {simulation.model.fiber_count} fibers, {count} segments, ", end="")
+    print(f"{scene.numerics.precision}, {simulation.device}, 1 worker")
+    print(f"{processor()}, warpfiber {commit()}")
+    print(f"{'pass':10}{'us/step':>10}{'ns/seg':>9}{'share':>8}{'B/seg':>8}{'GB/s':>8}{'copy':>8}")
+    on_cpu = simulation.device.startswith("cpu")
+    for name, time, launch in rows:
+        moved = bytes_moved(launch, method.list)
+        limit = copy_bandwidth(moved // 2) / 1e9 if on_cpu else float("nan")
+        rate = moved / max(time, 1e-12) / 1e9
+        print(
+            f"{name:10}{time * 1e6:10.1f}{time / count * 1e9:9.1f}{time / whole:8.1%}"
+            f"{moved / count:8.0f}{rate:8.1f}{limit:8.1f}"
+        )
+    if method.list is not None:
+        time = seconds / steps
+        print(f"{'list':10}{time * 1e6:10.1f}{time / count * 1e9:9.1f}{time / whole:8.1%}")
+    print(f"{'sum':10}{whole * 1e6:10.1f}{whole / count * 1e9:9.1f}")
+    if method.list is not None:
+        print_list(method, count, builds, seconds, steps)
+    simulation.close()
+
+
+def list_state(method: Any) -> tuple[int, float]:
+    """Builds so far and their seconds."""
+    return (method.list.build_count if method.list else 0), method.list_seconds
+
+
+def print_list(method: Any, count: int, builds: int, seconds: float, steps: int) -> None:
+    """Statistics of the neighbor list."""
+    pairs = method.list
+    acting = int(method.pair_acts.numpy()[: pairs.pair_count].astype(bool).sum())
+    rows = {
+        "builds": f"{builds} in {steps} steps",
+        "per build": f"{seconds / max(builds, 1) / count * 1e9:.0f} ns per segment",
+        "skin": f"{pairs.skin / pairs.reach:.3f} of the reach",
+        "listed pairs": f"{pairs.pair_count / count:.3f} per segment",
+        "acting pairs": f"{acting / count:.3f} per segment",
+        "capacity": f"{pairs.pair_capacity} pairs, {pairs.row_capacity} per row",
+        "cells": "x".join(map(str, pairs.cells.numpy()[0])),
+    }
+    print("\n".join(f"{name:14}{text}" for name, text in rows.items()))
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--set", action="append", default=[], type=parse_override)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--warm", type=int, default=200)
+    profile(parser.parse_args())
+
+
+if __name__ == "__main__":
+    main()
