@@ -15,6 +15,10 @@ from warpfiber.passes.pairs import make_pair_sweep
 if TYPE_CHECKING:
     from warpfiber.methods.bead_chain import BeadChain
 
+# The reach of every single pair is computed on the device; its bound must not be smaller by
+# rounding.
+REACH_MARGIN = 1.0 + 1e-5
+
 
 def step_launches(chain: BeadChain) -> list[Launch]:
     """Clock, pairs (where there are any) and nodes, in this order."""
@@ -63,6 +67,7 @@ def pair_launch(chain: BeadChain) -> Launch:
             p.real(_lubrication_dt(chain)),
             p.real(chain.strength),
             p.real(chain.decay),
+            p.real(REACH_MARGIN * pairs.reach),
             model.groups,
             model.fiber_node_start,
             model.fiber_group,

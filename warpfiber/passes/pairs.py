@@ -227,6 +227,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
         dt: real,
         strength: real,
         decay: real,
+        reach_bound: real,
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -254,9 +255,6 @@ def make_pair_sweep(name: str, features: PairFeatures):
         if begin == end:
             return
         node_i = segment_node[i]
-        fiber_i = segment_fiber[i]
-        gi = groups[fiber_group[fiber_i]]
-        at_i = node_i - fiber_node_start[fiber_i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
         for k in range(begin, end):
@@ -269,6 +267,13 @@ def make_pair_sweep(name: str, features: PairFeatures):
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
             dd = wp.length_sq(c)
+            # most listed pairs end here, before anything is read of their fibers
+            if not (dd <= reach_bound * reach_bound):
+                pair_acts_out[k] = wp.uint8(0)
+                continue
+            fiber_i = segment_fiber[i]
+            gi = groups[fiber_group[fiber_i]]
+            at_i = node_i - fiber_node_start[fiber_i]
             fiber_j = segment_fiber[j]
             gj = groups[fiber_group[fiber_j]]
             contact = gi.radius + gj.radius
