@@ -9,6 +9,7 @@ import warp as wp
 
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.native_pairs import make_native_pair_sweep, native_chunks
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import make_pair_sweep
 
@@ -56,14 +57,19 @@ def clock_launch(chain: BeadChain) -> Launch:
 
 
 def pair_launch(chain: BeadChain) -> Launch:
-    """Forces of all listed pairs."""
+    """Forces of all listed pairs, by the native sweep on the CPU."""
     model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     assert pairs is not None
+    kernel, dim = make_pair_sweep(p.name, chain.pair_features), model.segment_count
+    if chain.native:
+        kernel = make_native_pair_sweep(p.name, chain.pair_features)
+        dim = native_chunks(model.segment_count)
     return Launch(
         "pairs",
-        make_pair_sweep(p.name, chain.pair_features),
-        model.segment_count,
+        kernel,
+        dim,
         [
+            *([native_chunks(model.segment_count)] if chain.native else []),
             p.real(_lubrication_dt(chain)),
             p.real(chain.strength),
             p.real(chain.decay),
@@ -76,6 +82,7 @@ def pair_launch(chain: BeadChain) -> Launch:
             state.gradient,
             state.lattice_now,
             pairs.out_start,
+            pairs.pair_i,
             pairs.pair_j,
             pairs.pair_image,
             state.node_pos,

@@ -208,18 +208,117 @@ def make_pair_geometry(name: str, features: PairFeatures):
 
 
 @cache
-def make_pair_sweep(name: str, features: PairFeatures):
-    """Kernel `pair_sweep` in the given precision with the given features."""
+def make_pair_law(name: str, features: PairFeatures):
+    """`apply_pair_law`: what one pair within the largest reach of the scene does."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
-    closest_fractions, image_shift, is_local_minimum, lubricate = make_pair_geometry(name, features)
+    _, _, is_local_minimum, lubricate = make_pair_geometry(name, features)
     repulsion_size, _ = make_repulsion(name)
     zero = real(0.0)
     repulsion_range, lubrication_range = real(RANGE), real(OUTER)
     has_repulsion = features.repulsion
     has_lubrication = features.lubrication != "none"
     sheared = features.sheared
+
+    @wp.func
+    def apply_pair_law(
+        k: wp.int32,
+        i: wp.int32,
+        j: wp.int32,
+        node_i: wp.int32,
+        node_j: wp.int32,
+        a: vec3,
+        b: vec3,
+        delta: vec3,
+        shift: vec3,
+        st: vec2,
+        dt: real,
+        strength: real,
+        decay: real,
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=mat33),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        pair_acts_out: wp.array(dtype=wp.uint8),
+        pair_force_out: wp.array(dtype=vec3),
+        pair_closest_out: wp.array(dtype=vec2),
+        pair_arm_i_out: wp.array(dtype=vec3),
+        pair_arm_j_out: wp.array(dtype=vec3),
+    ):
+        c = delta + st[1] * b - st[0] * a
+        dd = wp.length_sq(c)
+        fiber_i = segment_fiber[i]
+        fiber_j = segment_fiber[j]
+        gi = groups[fiber_group[fiber_i]]
+        gj = groups[fiber_group[fiber_j]]
+        contact = gi.radius + gj.radius
+        at_i = node_i - fiber_node_start[fiber_i]
+        at_j = node_j - fiber_node_start[fiber_j]
+        force = vec3(zero, zero, zero)
+        acts = wp.uint8(0)
+        if wp.static(has_repulsion):
+            reach = repulsion_range * contact
+            if dd <= reach * reach:
+                if is_local_minimum(
+                    st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
+                ):
+                    distance = wp.sqrt(dd)
+                    direction = wp.normalize(c)
+                    if dd == zero:
+                        direction = wp.normalize(wp.cross(a, b))
+                    force = -repulsion_size(strength, decay, distance, contact) * direction
+                    acts = wp.uint8(1)
+        if wp.static(has_lubrication):
+            arm_i = st[0] * force
+            arm_j = st[1] * force
+            reach = lubrication_range * contact
+            if dd <= reach * reach:
+                moving = vec3(zero, zero, zero)
+                if wp.static(sheared):
+                    moving = gradient[0] * shift
+                squeeze, squeeze_i, squeeze_j, active = lubricate(
+                    gi,
+                    gj,
+                    at_i,
+                    at_j,
+                    delta,
+                    a,
+                    b,
+                    node_velocity[node_i],
+                    node_velocity[node_i + 1],
+                    node_velocity[node_j] + moving,
+                    node_velocity[node_j + 1] + moving,
+                    dt,
+                )
+                if active > 0:
+                    acts = wp.uint8(1)
+                    force += squeeze
+                    arm_i += squeeze_i
+                    arm_j += squeeze_j
+            if acts != wp.uint8(0):
+                pair_arm_i_out[k] = arm_i
+                pair_arm_j_out[k] = arm_j
+        elif acts != wp.uint8(0):
+            pair_closest_out[k] = st
+        pair_acts_out[k] = acts
+        if acts != wp.uint8(0):
+            pair_force_out[k] = force
+
+    return apply_pair_law
+
+
+@cache
+def make_pair_sweep(name: str, features: PairFeatures):
+    """Kernel `pair_sweep` in the given precision with the given features; one thread per segment."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    closest_fractions, image_shift, _, _ = make_pair_geometry(name, features)
+    apply_pair_law = make_pair_law(name, features)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def pair_sweep(
@@ -236,6 +335,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
         gradient: wp.array(dtype=mat33),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
@@ -265,67 +365,36 @@ def make_pair_sweep(name: str, features: PairFeatures):
             shift = image_shift(pair_image[k], lattice[0])
             delta = xj - xi + shift
             st = closest_fractions(delta, a, b)
-            c = delta + st[1] * b - st[0] * a
-            dd = wp.length_sq(c)
             # most listed pairs end here, before anything is read of their fibers
-            if not (dd <= reach_bound * reach_bound):
+            if not (wp.length_sq(delta + st[1] * b - st[0] * a) <= reach_bound * reach_bound):
                 pair_acts_out[k] = wp.uint8(0)
                 continue
-            fiber_i = segment_fiber[i]
-            gi = groups[fiber_group[fiber_i]]
-            at_i = node_i - fiber_node_start[fiber_i]
-            fiber_j = segment_fiber[j]
-            gj = groups[fiber_group[fiber_j]]
-            contact = gi.radius + gj.radius
-            at_j = node_j - fiber_node_start[fiber_j]
-            force = vec3(zero, zero, zero)
-            acts = wp.uint8(0)
-            if wp.static(has_repulsion):
-                reach = repulsion_range * contact
-                if dd <= reach * reach:
-                    if is_local_minimum(
-                        st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
-                    ):
-                        distance = wp.sqrt(dd)
-                        direction = wp.normalize(c)
-                        if dd == zero:
-                            direction = wp.normalize(wp.cross(a, b))
-                        force = -repulsion_size(strength, decay, distance, contact) * direction
-                        acts = wp.uint8(1)
-            if wp.static(has_lubrication):
-                arm_i = st[0] * force
-                arm_j = st[1] * force
-                reach = lubrication_range * contact
-                if dd <= reach * reach:
-                    moving = vec3(zero, zero, zero)
-                    if wp.static(sheared):
-                        moving = gradient[0] * shift
-                    squeeze, squeeze_i, squeeze_j, active = lubricate(
-                        gi,
-                        gj,
-                        at_i,
-                        at_j,
-                        delta,
-                        a,
-                        b,
-                        node_velocity[node_i],
-                        node_velocity[node_i + 1],
-                        node_velocity[node_j] + moving,
-                        node_velocity[node_j + 1] + moving,
-                        dt,
-                    )
-                    if active > 0:
-                        acts = wp.uint8(1)
-                        force += squeeze
-                        arm_i += squeeze_i
-                        arm_j += squeeze_j
-                if acts != wp.uint8(0):
-                    pair_arm_i_out[k] = arm_i
-                    pair_arm_j_out[k] = arm_j
-            elif acts != wp.uint8(0):
-                pair_closest_out[k] = st
-            pair_acts_out[k] = acts
-            if acts != wp.uint8(0):
-                pair_force_out[k] = force
+            apply_pair_law(
+                k,
+                i,
+                j,
+                node_i,
+                node_j,
+                a,
+                b,
+                delta,
+                shift,
+                st,
+                dt,
+                strength,
+                decay,
+                groups,
+                fiber_node_start,
+                fiber_group,
+                segment_fiber,
+                gradient,
+                node_pos,
+                node_velocity,
+                pair_acts_out,
+                pair_force_out,
+                pair_closest_out,
+                pair_arm_i_out,
+                pair_arm_j_out,
+            )
 
     return pair_sweep

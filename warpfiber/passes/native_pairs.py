@@ -1,0 +1,252 @@
+"""The pair sweep on the CPU: many distances at once, then the law of the few pairs within reach.
+
+A native block computes the closest points of 64 listed pairs in vector registers, in the order of
+operations of `segment_distance`, and says which pairs are within the largest reach of the scene.
+Those take the same law as in the plain sweep (`pairs.apply_pair_law`), so the physics has one
+source and the results are the same to the last bit. Pairs are independent of one another: the
+result does not depend on how they are cut into blocks or workers.
+
+Limits: CPU only (clang vector types); every other device takes `pairs.make_pair_sweep`.
+"""
+
+from functools import cache
+from string import Template
+
+import warp as wp
+
+from warpfiber.model import HALT, PAIR_COUNT, precision
+from warpfiber.passes.pairs import (
+    NO_IMAGE,
+    PairFeatures,
+    make_pair_geometry,
+    make_pair_law,
+)
+from warpfiber.passes.precision import group_struct
+
+BLOCK = 64  # pairs whose answers fit into the bits of one integer
+LANES = {"float32": 8, "float64": 8}  # pairs in one vector
+CHUNK_SEGMENTS = 64  # segments per launch index: workers share blocks in such portions
+
+# Rows (x, y, z, unused) of the pairs are loaded as they lie in memory and transposed to one
+# vector per component. The second row of a segment is read from its end, so that nothing behind
+# the last node is touched. Arguments as of `near_pairs` below.
+NEAR_PAIRS = Template("""
+    typedef $real real;
+    typedef real row_t __attribute__((ext_vector_type(4)));
+    typedef real lane_t __attribute__((ext_vector_type($lanes)));
+    typedef bool bits_t __attribute__((ext_vector_type($lanes)));
+    struct rows_t { row_t r[$lanes]; };
+    struct point_t { lane_t x, y, z; };
+    auto load = [](const real* from) { row_t r; __builtin_memcpy(&r, from, sizeof(r)); return r; };
+    auto transpose = [](const rows_t& m) {
+        point_t p;
+        for (int q = 0; q < $lanes; q += 4) {
+            row_t lo0 = __builtin_shufflevector(m.r[q], m.r[q + 1], 0, 4, 2, 6);
+            row_t hi0 = __builtin_shufflevector(m.r[q], m.r[q + 1], 1, 5, 3, 7);
+            row_t lo1 = __builtin_shufflevector(m.r[q + 2], m.r[q + 3], 0, 4, 2, 6);
+            row_t hi1 = __builtin_shufflevector(m.r[q + 2], m.r[q + 3], 1, 5, 3, 7);
+            row_t x = __builtin_shufflevector(lo0, lo1, 0, 1, 4, 5);
+            row_t y = __builtin_shufflevector(hi0, hi1, 0, 1, 4, 5);
+            row_t z = __builtin_shufflevector(lo0, lo1, 2, 3, 6, 7);
+            __builtin_memcpy((real*)&p.x + q, &x, sizeof(x));
+            __builtin_memcpy((real*)&p.y + q, &y, sizeof(y));
+            __builtin_memcpy((real*)&p.z + q, &z, sizeof(z));
+        }
+        return p;
+    };
+    auto dot = [](const point_t& u, const point_t& v) {
+        return u.x * v.x + u.y * v.y + u.z * v.z;
+    };
+    auto larger = [](lane_t u, lane_t v) { return u > v ? u : v; };
+    auto clamp = [](lane_t u) {
+        u = u > real(0) ? u : lane_t(real(0));
+        return u < real(1) ? u : lane_t(real(1));
+    };
+    const real* nodes = (const real*)node_pos.data;
+    const int* segment = segment_node.data;
+    unsigned long long near = 0;
+    for (int group = 0; group < count; group += $lanes) {
+        rows_t rows_a, rows_b, rows_delta;
+        for (int q = 0; q < $lanes; ++q) {
+            int k = first + (group + q < count ? group + q : count - 1);
+            const real* i = nodes + 3 * (long long)segment[pair_i.data[k]];
+            const real* j = nodes + 3 * (long long)segment[pair_j.data[k]];
+            row_t xi = load(i), xj = load(j);
+            rows_a.r[q] = load(i + 2).yzww - xi;
+            rows_b.r[q] = load(j + 2).yzww - xj;
+            row_t delta = xj - xi;
+            $shift
+            rows_delta.r[q] = delta;
+        }
+        point_t a = transpose(rows_a), b = transpose(rows_b), delta = transpose(rows_delta);
+        lane_t aa = larger(dot(a, a), real($tiny)), bb = larger(dot(b, b), real($tiny));
+        lane_t ab = dot(a, b), da = dot(delta, a), db = dot(delta, b);
+        lane_t den = larger(aa * bb - ab * ab, real($eps) * aa * bb);
+        lane_t s = clamp((da * bb - db * ab) / den);
+        lane_t t = clamp((s * ab - db) / bb);
+        s = clamp((t * ab + da) / aa);
+        point_t c = {
+            delta.x + t * b.x - s * a.x, delta.y + t * b.y - s * a.y, delta.z + t * b.z - s * a.z
+        };
+        bits_t within = __builtin_convertvector(dot(c, c) <= reach_bound * reach_bound, bits_t);
+        unsigned long long bits = 0;
+        __builtin_memcpy(&bits, &within, sizeof(within));
+        near |= bits << group;
+    }
+    __builtin_memset(pair_acts.data + first, 0, count);
+    return count < 64 ? near & ((1ull << count) - 1) : near;
+""")
+# an image of the partner is rare, but in periodic boxes only
+SHIFT = Template("""if (pair_image.data[k] != $none) {
+                int code = pair_image.data[k];
+                wp::vec_t<3, real> n(
+                    real((code & 1023) - 512),
+                    real(((code >> 10) & 1023) - 512),
+                    real(((code >> 20) & 1023) - 512)
+                );
+                wp::vec_t<3, real> v = wp::mul(lattice.data[0], n);
+                delta += row_t{v.c[0], v.c[1], v.c[2], real(0)};
+            }""")
+
+
+def native_chunks(segment_count: int) -> int:
+    """Launch dimension of the native sweep; every index takes an equal share of the blocks."""
+    return max(1, segment_count // CHUNK_SEGMENTS)
+
+
+@cache
+def make_near_pairs(name: str, periodic: bool):
+    """`near_pairs(...)` -> bits of the pairs first ... first + count - 1 within reach."""
+    p = precision(name)
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    snippet = NEAR_PAIRS.substitute(
+        real={"float32": "float", "float64": "double"}[name],
+        lanes=LANES[name],
+        shift=SHIFT.substitute(none=NO_IMAGE) if periodic else "",
+        tiny="1.0e-30",
+        eps=p.eps,
+    )
+
+    @wp.func_native(snippet)
+    def near_pairs(
+        first: wp.int32,
+        count: wp.int32,
+        reach_bound: real,
+        segment_node: wp.array(dtype=wp.int32),
+        lattice: wp.array(dtype=mat33),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        node_pos: wp.array(dtype=vec3),
+        pair_acts: wp.array(dtype=wp.uint8),
+    ) -> wp.uint64: ...
+
+    return near_pairs
+
+
+@wp.func_native("return __builtin_ctzll(bits);")
+def lowest_bit(bits: wp.uint64) -> wp.int32: ...
+
+
+@cache
+def make_native_pair_sweep(name: str, features: PairFeatures):
+    """Kernel like `pairs.pair_sweep`; index t of `chunks` takes its share of the pair blocks."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    closest_fractions, image_shift, _, _ = make_pair_geometry(name, features)
+    apply_pair_law = make_pair_law(name, features)
+    near_pairs = make_near_pairs(name, features.periodic)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def native_pair_sweep(
+        offset: wp.int32,
+        chunks: wp.int32,
+        dt: real,
+        strength: real,
+        decay: real,
+        reach_bound: real,
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=mat33),
+        lattice: wp.array(dtype=mat33),
+        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        pair_acts_out: wp.array(dtype=wp.uint8),
+        pair_force_out: wp.array(dtype=vec3),
+        pair_closest_out: wp.array(dtype=vec2),
+        pair_arm_i_out: wp.array(dtype=vec3),
+        pair_arm_j_out: wp.array(dtype=vec3),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        chunk = wp.tid() + offset
+        total = status[wp.static(PAIR_COUNT)]
+        blocks = (total + wp.static(BLOCK - 1)) / wp.static(BLOCK)
+        begin = wp.int32(wp.int64(blocks) * wp.int64(chunk) / wp.int64(chunks))
+        end = wp.int32(wp.int64(blocks) * wp.int64(chunk + 1) / wp.int64(chunks))
+        for block in range(begin, end):
+            first = block * wp.static(BLOCK)
+            near = near_pairs(
+                first,
+                wp.min(total - first, wp.static(BLOCK)),
+                reach_bound,
+                segment_node,
+                lattice,
+                pair_i,
+                pair_j,
+                pair_image,
+                node_pos,
+                pair_acts_out,
+            )
+            while near != wp.uint64(0):
+                k = first + lowest_bit(near)
+                near = near & (near - wp.uint64(1))
+                i = pair_i[k]
+                j = pair_j[k]
+                node_i = segment_node[i]
+                node_j = segment_node[j]
+                xi = node_pos[node_i]
+                xj = node_pos[node_j]
+                a = node_pos[node_i + 1] - xi
+                b = node_pos[node_j + 1] - xj
+                shift = image_shift(pair_image[k], lattice[0])
+                delta = xj - xi + shift
+                st = closest_fractions(delta, a, b)
+                apply_pair_law(
+                    k,
+                    i,
+                    j,
+                    node_i,
+                    node_j,
+                    a,
+                    b,
+                    delta,
+                    shift,
+                    st,
+                    dt,
+                    strength,
+                    decay,
+                    groups,
+                    fiber_node_start,
+                    fiber_group,
+                    segment_fiber,
+                    gradient,
+                    node_pos,
+                    node_velocity,
+                    pair_acts_out,
+                    pair_force_out,
+                    pair_closest_out,
+                    pair_arm_i_out,
+                    pair_arm_j_out,
+                )
+
+    return native_pair_sweep
