@@ -57,45 +57,39 @@ def clock_launch(chain: BeadChain) -> Launch:
 
 
 def pair_launch(chain: BeadChain) -> Launch:
-    """Forces of all listed pairs, by the native sweep on the CPU."""
+    """Forces of all listed pairs: by blocks of pairs on the CPU, else by segments."""
     model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     assert pairs is not None
-    kernel, dim = make_pair_sweep(p.name, chain.pair_features), model.segment_count
+    inputs = [
+        p.real(_lubrication_dt(chain)),
+        p.real(chain.strength),
+        p.real(chain.decay),
+        p.real(REACH_MARGIN * pairs.reach),
+        model.groups,
+        model.fiber_node_start,
+        model.fiber_group,
+        model.segment_node,
+        model.segment_fiber,
+        state.gradient,
+        state.lattice_now,
+        pairs.pair_i if chain.native else pairs.out_start,
+        pairs.pair_j,
+        pairs.pair_image,
+        state.node_pos,
+        state.node_velocity,
+        state.status,
+        chain.pair_acts,
+        chain.pair_force,
+        chain.pair_closest,
+        chain.pair_arm_i,
+        chain.pair_arm_j,
+    ]
     if chain.native:
         kernel = make_native_pair_sweep(p.name, chain.pair_features)
-        dim = native_chunks(model.segment_count)
-    return Launch(
-        "pairs",
-        kernel,
-        dim,
-        [
-            *([native_chunks(model.segment_count)] if chain.native else []),
-            p.real(_lubrication_dt(chain)),
-            p.real(chain.strength),
-            p.real(chain.decay),
-            p.real(REACH_MARGIN * pairs.reach),
-            model.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            model.segment_node,
-            model.segment_fiber,
-            state.gradient,
-            state.lattice_now,
-            pairs.out_start,
-            pairs.pair_i,
-            pairs.pair_j,
-            pairs.pair_image,
-            state.node_pos,
-            state.node_velocity,
-            state.status,
-            chain.pair_acts,
-            chain.pair_force,
-            chain.pair_closest,
-            chain.pair_arm_i,
-            chain.pair_arm_j,
-        ],
-        split=True,
-    )
+        chunks = native_chunks(model.segment_count)
+        return Launch("pairs", kernel, chunks, [chunks, *inputs], split=True)
+    kernel = make_pair_sweep(p.name, chain.pair_features)
+    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
 
 
 def _lubrication_dt(chain: BeadChain) -> float:

@@ -1,6 +1,7 @@
 """One sweep over listed pairs: capsule repulsion and bead lubrication between two segments.
 
-One thread owns a segment and its outgoing pairs. It stores per pair whether it acts and, only then,
+One thread owns a segment and its outgoing pairs (on the CPU `native_pairs` has blocks of pairs
+instead). It stores per pair whether it acts and, only then,
 the force on the owner and where it acts (a slot that does not act keeps stale values); the node
 sweep gathers, so nothing is added atomically and the result does not depend on the number of
 workers. `closest`: force and the fractions (s, t) of the one point pair. `arms`:
@@ -313,7 +314,7 @@ def make_pair_law(name: str, features: PairFeatures):
 
 @cache
 def make_pair_sweep(name: str, features: PairFeatures):
-    """Kernel `pair_sweep` in the given precision with the given features; one thread per segment."""
+    """Kernel `pair_sweep` in the given precision with the given features, over segments."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
@@ -335,7 +336,6 @@ def make_pair_sweep(name: str, features: PairFeatures):
         gradient: wp.array(dtype=mat33),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
