@@ -1,11 +1,11 @@
 """Bead lubrication of several pairs at once: text of the native pair sweep on the CPU.
 
 Every lane owns one pair and walks over its own bead pairs (m, n) in the order of
-`pairs.lubricate`, with the same operations, so that both give the same bits. The beads of i that
-can be near form an interval, and those of j near to one of them another: a lane goes from one
-candidate to the next and the lanes need as many rounds as the longest of them.
+`bead_pairs.lubricate`, with the same operations, so that both give the same bits. The beads of i
+that can be near form an interval, and those of j near to one of them another: a lane goes from one
+candidate to the next, and the lanes need as many rounds as the longest of them.
 
-Source: as `pairs.lubricate`. With q(s) = D - s a across b, |q|^2 <= reach^2 bounds s; with p =
+Source: as `bead_pairs.lubricate`. With q(s) = D - s a across b, |q|^2 <= reach^2 bounds s; with p =
     |q(s)|^2 the beads of j are at most sqrt((reach^2 - p) / b^2) from the foot of s. Both bounds
     are widened by more than their rounding; the distance itself decides, as in the law.
 """
