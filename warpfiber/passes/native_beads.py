@@ -20,7 +20,6 @@ MARGIN = {"float32": 1e-4, "float64": 1e-9}
 STEEP = 1e-2
 
 SQUEEZE_PAIRS = Template("""
-    near &= ~touch;
     const bool alike = groups.shape[0] == 1;
     const int segments = segment_node.shape[0];
     const auto* group_of = fiber_group.data;
@@ -165,7 +164,7 @@ MOVING = """if (pair_image.data[ks[q]] != none) {
 
 
 def squeeze_text(name: str, lanes: int, lubrication: str, sheared: bool) -> str:
-    """The part of the native block that treats near pairs; returns the touching ones."""
+    """The part of the native block that lubricates near pairs; returns the touching ones."""
     return SQUEEZE_PAIRS.substitute(
         lanes=lanes,
         moving=MOVING if sheared else "",

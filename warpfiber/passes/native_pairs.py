@@ -2,10 +2,10 @@
 
 A native block computes the closest points of 64 listed pairs in vector registers, in the order of
 operations of `segment_distance`, and says which pairs are within the largest reach of the scene.
-Those take the law of the plain sweep (`pairs.apply_pair_law`), so that it has one source; where
-pairs lubricate, those that do not touch as well are treated in vectors too (`native_beads`). The
-results are those of the plain sweep to the last bit. Pairs are independent of one another, so they
-do not depend on how the list is cut into blocks or workers.
+Those take the law of the plain sweep (`pairs.apply_pair_law`), so that it has one source; only
+their lubrication is computed in vectors as well (`native_beads`). The results are those of the
+plain sweep to the last bit. Pairs are independent of one another, so they do not depend on how the
+list is cut into blocks or workers.
 
 Limits: CPU only (clang vector types); every other device takes `pairs.make_pair_sweep`.
 """
@@ -118,7 +118,7 @@ NEAR_PAIRS = Template("""
         };
         lane_t dd = dot(c, c);
         near |= bits(dd <= reach_bound * reach_bound) << group;
-        touch |= bits(dd <= touch_bound * wp::abs(touch_bound)) << group;
+        touch |= bits(dd <= touch_bound * touch_bound) << group;
     }
     if (count < 64) {
         near &= (1ull << count) - 1;
@@ -143,8 +143,8 @@ def native_chunks(segment_count: int) -> int:
 def make_pair_block(name: str, features: PairFeatures):
     """`pair_block(...)` -> bits of the pairs first ... first + count - 1 that are left to the law.
 
-    Clears their `pair_acts`. Pairs further than `reach_bound` are done with that; with lubrication
-    those further than `touch_bound` are treated here, without it the bits are those within reach.
+    Clears their `pair_acts`. Without lubrication the bits are the pairs within `reach_bound`; else
+    these are lubricated here, and the bits are those within `touch_bound`, which repel as well.
     """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -203,9 +203,9 @@ def make_native_pair_sweep(name: str, features: PairFeatures):
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, features)
-    apply_pair_law = make_pair_law(name, features)
+    apply_pair_law = make_pair_law(name, features, is_squeezed=features.lubrication != "none")
     pair_block = make_pair_block(name, features)
-    touch_share = real(RANGE / OUTER if features.repulsion else -1.0)
+    touch_share = real(RANGE / OUTER)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def native_pair_sweep(

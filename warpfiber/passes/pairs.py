@@ -130,8 +130,11 @@ def make_pair_geometry(name: str, features: PairFeatures):
 
 
 @cache
-def make_pair_law(name: str, features: PairFeatures):
-    """`apply_pair_law`: what one pair within the largest reach of the scene does."""
+def make_pair_law(name: str, features: PairFeatures, is_squeezed: bool = False):
+    """`apply_pair_law`: what one pair within the largest reach of the scene does.
+
+    `is_squeezed`: its lubrication is stored already and only the repulsion is to be added.
+    """
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
@@ -198,7 +201,13 @@ def make_pair_law(name: str, features: PairFeatures):
             arm_i = st[0] * force
             arm_j = st[1] * force
             reach = lubrication_range * contact
-            if dd <= reach * reach:
+            if wp.static(is_squeezed):
+                acts |= pair_acts_out[k]
+                if pair_acts_out[k] != wp.uint8(0):
+                    force += pair_force_out[k]
+                    arm_i += pair_arm_i_out[k]
+                    arm_j += pair_arm_j_out[k]
+            elif dd <= reach * reach:
                 moving = vec3(zero, zero, zero)
                 if wp.static(sheared):
                     moving = gradient[0] * shift
