@@ -32,6 +32,7 @@ from warpfiber.scene import Scene
 # Below this many segments the hand-off between workers costs more than it saves.
 WORKER_BREAK_EVEN = 5000
 LIST_SKIN = 0.3  # diameters
+NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 STRETCH_GROWTH = 1.2  # how much longer segments may be after they outgrew the cells of the list
 
 
@@ -51,6 +52,7 @@ class BeadChain:
         self.scene, self.model, self.state = scene, model, state
         self.dt = dt / model.units.time
         self.workers = self._choose_workers(workers)
+        self.native = NATIVE and model.device.startswith("cpu")
         units, contact, domain = model.units, scene.contact, model.domain
         self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
         self.flow_origin = np.zeros(3)

@@ -9,11 +9,16 @@ import warp as wp
 
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.native_pairs import make_native_pair_sweep, native_chunks
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import make_pair_sweep
 
 if TYPE_CHECKING:
     from warpfiber.methods.bead_chain import BeadChain
+
+# The reach of every single pair is computed on the device; its bound must not be smaller by
+# rounding.
+REACH_MARGIN = 1.0 + 1e-5
 
 
 def step_launches(chain: BeadChain) -> list[Launch]:
@@ -52,38 +57,39 @@ def clock_launch(chain: BeadChain) -> Launch:
 
 
 def pair_launch(chain: BeadChain) -> Launch:
-    """Forces of all listed pairs."""
+    """Forces of all listed pairs: by blocks of pairs on the CPU, else by segments."""
     model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     assert pairs is not None
-    return Launch(
-        "pairs",
-        make_pair_sweep(p.name, chain.pair_features),
-        model.segment_count,
-        [
-            p.real(_lubrication_dt(chain)),
-            p.real(chain.strength),
-            p.real(chain.decay),
-            model.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            model.segment_node,
-            model.segment_fiber,
-            state.gradient,
-            state.lattice_now,
-            pairs.out_start,
-            pairs.pair_j,
-            pairs.pair_image,
-            state.node_pos,
-            state.node_velocity,
-            state.status,
-            chain.pair_acts,
-            chain.pair_force,
-            chain.pair_closest,
-            chain.pair_arm_i,
-            chain.pair_arm_j,
-        ],
-        split=True,
-    )
+    inputs = [
+        p.real(_lubrication_dt(chain)),
+        p.real(chain.strength),
+        p.real(chain.decay),
+        p.real(REACH_MARGIN * pairs.reach),
+        model.groups,
+        model.fiber_node_start,
+        model.fiber_group,
+        model.segment_node,
+        model.segment_fiber,
+        state.gradient,
+        state.lattice_now,
+        pairs.pair_i if chain.native else pairs.out_start,
+        pairs.pair_j,
+        pairs.pair_image,
+        state.node_pos,
+        state.node_velocity,
+        state.status,
+        chain.pair_acts,
+        chain.pair_force,
+        chain.pair_closest,
+        chain.pair_arm_i,
+        chain.pair_arm_j,
+    ]
+    if chain.native:
+        kernel = make_native_pair_sweep(p.name, chain.pair_features)
+        chunks = native_chunks(model.segment_count)
+        return Launch("pairs", kernel, chunks, [chunks, *inputs], split=True)
+    kernel = make_pair_sweep(p.name, chain.pair_features)
+    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
 
 
 def _lubrication_dt(chain: BeadChain) -> float:

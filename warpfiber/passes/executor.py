@@ -185,7 +185,8 @@ class _Workers:
                 self.phase = phase
                 for lock in self.go:
                     lock.release()
-                wp.capture_launch(phase[0])
+                if phase[0] is not None:  # fewer items than workers: the last ones have them
+                    wp.capture_launch(phase[0])
                 for lock in self.done:
                     lock.acquire()
 

@@ -1,14 +1,14 @@
 """One sweep over listed pairs: capsule repulsion and bead lubrication between two segments.
 
-One thread owns a segment and its outgoing pairs. It stores per pair whether it acts and, only then,
-the force on the owner and where it acts (a slot that does not act keeps stale values); the node
-sweep gathers, so nothing is added atomically and the result does not depend on the number of
-workers. `closest`: force and the fractions (s, t) of the one point pair. `arms`:
-several bead pairs act, so the sums of s F and t F are stored instead.
+One thread owns a segment and its outgoing pairs (on the CPU `native_pairs` has blocks of pairs
+instead). It stores per pair whether it acts and, only then, the force on the owner and where it
+acts (a slot that does not act keeps stale values); the node sweep gathers, so nothing is added
+atomically and the result does not depend on the number of workers. `closest`: force and the
+fractions (s, t) of the one point pair. `arms`: several bead pairs act, so the sums of s F and t F
+are stored instead.
 
-Source: Sasayama & Inagaki 2018, Appendix A. Beads: a segment owns its first node and its inner
-    beads, the last segment also the last node, so that no bead counts twice. One repulsion per
-    local minimum of the distance between two fibers (the vertex rule of `is_local_minimum`).
+Source: Sasayama & Inagaki 2018, Appendix A. One repulsion per local minimum of the distance between
+    two fibers (the vertex rule of `is_local_minimum`).
 """
 
 from dataclasses import dataclass
@@ -16,10 +16,11 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.laws.lubrication import INNER, OUTER, make_lubrication
+from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE, make_repulsion
 from warpfiber.laws.segment_distance import make_segment_distance
 from warpfiber.model import HALT, precision
+from warpfiber.passes.bead_pairs import make_bead_pairs
 from warpfiber.passes.precision import group_struct
 
 IMAGE_BITS = 10  # per axis, offset by half: images -512 ... 511
@@ -84,15 +85,12 @@ def make_pair_geometry(name: str, features: PairFeatures):
     """Functions shared by the sweep and the measurement: distance vector, local minimum, beads."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
-    Group = group_struct(name)
     closest_fractions = make_segment_distance(name)
     _, unpack_image = make_image(name)
-    lubrication_resistance = make_lubrication(name)
-    zero, one, two = real(0.0), real(1.0), real(2.0)
+    lubricate = make_bead_pairs(name, features.lubrication == "shifted")
+    zero, one = real(0.0), real(1.0)
     periodic = features.periodic
-    inner, outer = real(INNER), real(OUTER)
     near = real(END_TOLERANCE[name])
-    is_shifted = features.lubrication == "shifted"
 
     @wp.func
     def image_shift(code: wp.int32, lattice: mat33) -> vec3:
@@ -128,92 +126,19 @@ def make_pair_geometry(name: str, features: PairFeatures):
                 return False
         return True
 
-    @wp.func
-    def bead_count(g: Group, at: wp.int32) -> wp.int32:
-        """Beads owned by the segment `at` of its fiber."""
-        count = g.inner_beads + 1
-        if at == g.segments - 1:
-            count += 1
-        return count
-
-    @wp.func
-    def lubricate(
-        gi: Group,
-        gj: Group,
-        at_i: wp.int32,
-        at_j: wp.int32,
-        delta: vec3,
-        a: vec3,
-        b: vec3,
-        vi0: vec3,
-        vi1: vec3,
-        vj0: vec3,
-        vj1: vec3,
-        dt: real,
-    ):
-        """Force on segment i, its moments (sum of s F, sum of t F), number of bead pairs."""
-        force = vec3(zero, zero, zero)
-        arm_i = vec3(zero, zero, zero)
-        arm_j = vec3(zero, zero, zero)
-        active = wp.int32(0)
-        contact = gi.radius + gj.radius
-        reach2 = (outer * contact) * (outer * contact)
-        nearest2 = (inner * contact) * (inner * contact)
-        narrow = gi.radius * gj.radius / contact
-        scale = (gi.drag / gi.radius) * narrow * narrow
-        shift = zero
-        if wp.static(is_shifted):
-            shift = two / contact
-        inverse_mass_dt = dt * (one / gi.mass + one / gj.mass)
-        count_i = bead_count(gi, at_i)
-        count_j = bead_count(gj, at_j)
-        per_bead_j = real(gj.inner_beads + 1)
-        step_i = one / real(gi.inner_beads + 1)
-        step_j = one / per_bead_j
-        bb = wp.dot(b, b)
-        inverse_bb = one / bb
-        span = outer * contact / wp.sqrt(bb) * per_bead_j
-        for m in range(count_i):
-            s = real(m) * step_i
-            weight_i = one
-            if m > 0 and m <= gi.inner_beads:
-                weight_i = gi.bead_weight
-            c0 = delta - s * a
-            # beads of j within reach of this bead lie around its foot on the line of j
-            foot = -wp.dot(c0, b) * inverse_bb
-            if wp.length_sq(c0 + foot * b) > reach2:
-                continue
-            n_first = wp.max(wp.int32(wp.ceil(foot * per_bead_j - span)), 0)
-            n_last = wp.min(wp.int32(wp.floor(foot * per_bead_j + span)), count_j - 1)
-            for n in range(n_first, n_last + 1):
-                t = real(n) * step_j
-                c = c0 + t * b
-                cc = wp.length_sq(c)
-                if cc < nearest2 or cc > reach2:
-                    continue
-                weight = weight_i
-                if n > 0 and n <= gj.inner_beads:
-                    weight *= gj.bead_weight
-                velocity = (one - t) * vj0 + t * vj1 - (one - s) * vi0 - s * vi1
-                gap = wp.sqrt(cc) - contact
-                resistance = lubrication_resistance(weight * scale, gap, shift, inverse_mass_dt)
-                f = (resistance * wp.dot(velocity, c) / cc) * c
-                force += f
-                arm_i += s * f
-                arm_j += t * f
-                active += 1
-        return force, arm_i, arm_j, active
-
     return closest_fractions, image_shift, is_local_minimum, lubricate
 
 
 @cache
-def make_pair_sweep(name: str, features: PairFeatures):
-    """Kernel `pair_sweep` in the given precision with the given features."""
+def make_pair_law(name: str, features: PairFeatures, is_squeezed: bool = False):
+    """`apply_pair_law`: what one pair within the largest reach of the scene does.
+
+    `is_squeezed`: its lubrication is stored already and only the repulsion is to be added.
+    """
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
-    closest_fractions, image_shift, is_local_minimum, lubricate = make_pair_geometry(name, features)
+    _, _, is_local_minimum, lubricate = make_pair_geometry(name, features)
     repulsion_size, _ = make_repulsion(name)
     zero = real(0.0)
     repulsion_range, lubrication_range = real(RANGE), real(OUTER)
@@ -221,12 +146,118 @@ def make_pair_sweep(name: str, features: PairFeatures):
     has_lubrication = features.lubrication != "none"
     sheared = features.sheared
 
+    @wp.func
+    def apply_pair_law(
+        k: wp.int32,
+        i: wp.int32,
+        j: wp.int32,
+        node_i: wp.int32,
+        node_j: wp.int32,
+        a: vec3,
+        b: vec3,
+        delta: vec3,
+        shift: vec3,
+        st: vec2,
+        dt: real,
+        strength: real,
+        decay: real,
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        gradient: wp.array(dtype=mat33),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        pair_acts_out: wp.array(dtype=wp.uint8),
+        pair_force_out: wp.array(dtype=vec3),
+        pair_closest_out: wp.array(dtype=vec2),
+        pair_arm_i_out: wp.array(dtype=vec3),
+        pair_arm_j_out: wp.array(dtype=vec3),
+    ):
+        c = delta + st[1] * b - st[0] * a
+        dd = wp.length_sq(c)
+        fiber_i = segment_fiber[i]
+        fiber_j = segment_fiber[j]
+        gi = groups[fiber_group[fiber_i]]
+        gj = groups[fiber_group[fiber_j]]
+        contact = gi.radius + gj.radius
+        at_i = node_i - fiber_node_start[fiber_i]
+        at_j = node_j - fiber_node_start[fiber_j]
+        force = vec3(zero, zero, zero)
+        acts = wp.uint8(0)
+        if wp.static(has_repulsion):
+            reach = repulsion_range * contact
+            if dd <= reach * reach:
+                if is_local_minimum(
+                    st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
+                ):
+                    distance = wp.sqrt(dd)
+                    direction = wp.normalize(c)
+                    if dd == zero:
+                        direction = wp.normalize(wp.cross(a, b))
+                    force = -repulsion_size(strength, decay, distance, contact) * direction
+                    acts = wp.uint8(1)
+        if wp.static(has_lubrication):
+            arm_i = st[0] * force
+            arm_j = st[1] * force
+            reach = lubrication_range * contact
+            if wp.static(is_squeezed):
+                acts |= pair_acts_out[k]
+                if pair_acts_out[k] != wp.uint8(0):
+                    force += pair_force_out[k]
+                    arm_i += pair_arm_i_out[k]
+                    arm_j += pair_arm_j_out[k]
+            elif dd <= reach * reach:
+                moving = vec3(zero, zero, zero)
+                if wp.static(sheared):
+                    moving = gradient[0] * shift
+                squeeze, squeeze_i, squeeze_j, active = lubricate(
+                    gi,
+                    gj,
+                    at_i,
+                    at_j,
+                    delta,
+                    a,
+                    b,
+                    node_velocity[node_i],
+                    node_velocity[node_i + 1],
+                    node_velocity[node_j] + moving,
+                    node_velocity[node_j + 1] + moving,
+                    dt,
+                )
+                if active > 0:
+                    acts = wp.uint8(1)
+                    force += squeeze
+                    arm_i += squeeze_i
+                    arm_j += squeeze_j
+            if acts != wp.uint8(0):
+                pair_arm_i_out[k] = arm_i
+                pair_arm_j_out[k] = arm_j
+        elif acts != wp.uint8(0):
+            pair_closest_out[k] = st
+        pair_acts_out[k] = acts
+        if acts != wp.uint8(0):
+            pair_force_out[k] = force
+
+    return apply_pair_law
+
+
+@cache
+def make_pair_sweep(name: str, features: PairFeatures):
+    """Kernel `pair_sweep` in the given precision with the given features, over segments."""
+    p = precision(name)
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
+    Group = group_struct(name)
+    closest_fractions, image_shift, _, _ = make_pair_geometry(name, features)
+    apply_pair_law = make_pair_law(name, features)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def pair_sweep(
         offset: wp.int32,
         dt: real,
         strength: real,
         decay: real,
+        reach_bound: real,
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -254,9 +285,6 @@ def make_pair_sweep(name: str, features: PairFeatures):
         if begin == end:
             return
         node_i = segment_node[i]
-        fiber_i = segment_fiber[i]
-        gi = groups[fiber_group[fiber_i]]
-        at_i = node_i - fiber_node_start[fiber_i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
         for k in range(begin, end):
@@ -267,60 +295,36 @@ def make_pair_sweep(name: str, features: PairFeatures):
             shift = image_shift(pair_image[k], lattice[0])
             delta = xj - xi + shift
             st = closest_fractions(delta, a, b)
-            c = delta + st[1] * b - st[0] * a
-            dd = wp.length_sq(c)
-            fiber_j = segment_fiber[j]
-            gj = groups[fiber_group[fiber_j]]
-            contact = gi.radius + gj.radius
-            at_j = node_j - fiber_node_start[fiber_j]
-            force = vec3(zero, zero, zero)
-            acts = wp.uint8(0)
-            if wp.static(has_repulsion):
-                reach = repulsion_range * contact
-                if dd <= reach * reach:
-                    if is_local_minimum(
-                        st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
-                    ):
-                        distance = wp.sqrt(dd)
-                        direction = wp.normalize(c)
-                        if dd == zero:
-                            direction = wp.normalize(wp.cross(a, b))
-                        force = -repulsion_size(strength, decay, distance, contact) * direction
-                        acts = wp.uint8(1)
-            if wp.static(has_lubrication):
-                arm_i = st[0] * force
-                arm_j = st[1] * force
-                reach = lubrication_range * contact
-                if dd <= reach * reach:
-                    moving = vec3(zero, zero, zero)
-                    if wp.static(sheared):
-                        moving = gradient[0] * shift
-                    squeeze, squeeze_i, squeeze_j, active = lubricate(
-                        gi,
-                        gj,
-                        at_i,
-                        at_j,
-                        delta,
-                        a,
-                        b,
-                        node_velocity[node_i],
-                        node_velocity[node_i + 1],
-                        node_velocity[node_j] + moving,
-                        node_velocity[node_j + 1] + moving,
-                        dt,
-                    )
-                    if active > 0:
-                        acts = wp.uint8(1)
-                        force += squeeze
-                        arm_i += squeeze_i
-                        arm_j += squeeze_j
-                if acts != wp.uint8(0):
-                    pair_arm_i_out[k] = arm_i
-                    pair_arm_j_out[k] = arm_j
-            elif acts != wp.uint8(0):
-                pair_closest_out[k] = st
-            pair_acts_out[k] = acts
-            if acts != wp.uint8(0):
-                pair_force_out[k] = force
+            # most listed pairs end here, before anything is read of their fibers
+            if not (wp.length_sq(delta + st[1] * b - st[0] * a) <= reach_bound * reach_bound):
+                pair_acts_out[k] = wp.uint8(0)
+                continue
+            apply_pair_law(
+                k,
+                i,
+                j,
+                node_i,
+                node_j,
+                a,
+                b,
+                delta,
+                shift,
+                st,
+                dt,
+                strength,
+                decay,
+                groups,
+                fiber_node_start,
+                fiber_group,
+                segment_fiber,
+                gradient,
+                node_pos,
+                node_velocity,
+                pair_acts_out,
+                pair_force_out,
+                pair_closest_out,
+                pair_arm_i_out,
+                pair_arm_j_out,
+            )
 
     return pair_sweep
