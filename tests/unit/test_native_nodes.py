@@ -134,24 +134,25 @@ def test_every_joint_angle(start: Start, precision: str) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e3])
 @pytest.mark.parametrize("last", [False, True])
-def test_torn_fiber_keeps_its_state(start: Start, bad: float, last: bool) -> None:
+@pytest.mark.parametrize("segments", [1, 4])
+def test_torn_fiber_keeps_its_state(start: Start, bad: float, last: bool, segments: int) -> None:
     """The other lanes of its block move on; of a padded block, only real lanes count."""
     rng = np.random.default_rng(5)
-    kind, count = Kind(4, 2.0), 11
+    kind, count, per_fiber = Kind(segments, 2.0), 11, segments + 1
     fibers = [bent_fiber(kind, rng, [30.0 * k, 0.0, 0.0]) for k in range(count)]
     torn = count - 1 if last else 3
-    sim = start([kind], fibers, velocity=rng.normal(size=(5 * count, 3)), flow=FLOW)
+    sim = start([kind], fibers, velocity=rng.normal(size=(per_fiber * count, 3)), flow=FLOW)
     nodes = sim.state.node_pos.numpy().copy()
-    nodes[5 * torn + 2, 1] = bad
+    nodes[per_fiber * torn + 1, 1] = bad
     sim.state.node_pos.assign(nodes)
     velocity = sim.state.node_velocity.numpy().copy()
     plain, native = sweep(sim, plain_node_launch), sweep(sim, native_node_launch)
     np.testing.assert_array_equal(native[2], plain[2])
     assert native[2][TORN] == 1 and native[2][BAD_FIBER] == torn
-    mine = slice(5 * torn, 5 * torn + 5)
+    mine = slice(per_fiber * torn, per_fiber * (torn + 1))
     np.testing.assert_array_equal(native[0][mine], nodes[mine])
     np.testing.assert_array_equal(native[1][mine], velocity[mine])
-    rest = np.delete(np.arange(5 * count), np.arange(5 * count)[mine])
+    rest = np.delete(np.arange(per_fiber * count), mine)
     np.testing.assert_allclose(native[0][rest], plain[0][rest], rtol=1e-13, atol=1e-12)
     assert (native[0][rest] != nodes[rest]).any(axis=1).all()
 
