@@ -144,7 +144,7 @@ class State:
 
     node_pos: Any  # (N,) vec3, wrapped by whole fibers at every list build
     node_velocity: Any  # (N,) vec3
-    node_force: Any  # (N,) vec3: work array, the force F^ND (or A^-1 F^ND) that moves a node
+    node_force: Any  # (N,) vec3: work array of the plain node sweep, F^ND (or A^-1 F^ND)
     fiber_image: Any  # (F,) vec3i: unwrapped = node_pos + lattice * fiber_image
     status: Any  # (STATUS_SIZE,) int32
     step: Any  # (1,) int64

@@ -51,6 +51,7 @@ def node_forces(
     sim = start(**drop, numerics=numerics, **tables)
     if lattice is not None:
         sim.state.lattice.assign((lattice / sim.model.units.length)[None])
+    sim.method.native_nodes = False  # the SIMD sweep keeps the forces to itself
     sim.step()
     return sim.state.node_force.numpy().astype(float) * sim.model.units.force
 

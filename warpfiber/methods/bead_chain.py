@@ -87,6 +87,7 @@ class BeadChain:
             )
             self.check_box()
         self._allocate_pair_results()
+        self.native_nodes = True  # the SIMD node sweep where it applies; read by `prepare`
         self.executor: Executor | None = None
         self._status_view: np.ndarray | None = None
 

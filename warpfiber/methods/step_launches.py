@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.native import LANES
+from warpfiber.passes.native_nodes import (
+    fiber_blocks,
+    make_native_node_sweep,
+    native_nodes_apply,
+)
 from warpfiber.passes.native_pairs import make_native_pair_sweep, native_chunks
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import make_pair_sweep
@@ -103,51 +109,81 @@ def _lubrication_dt(chain: BeadChain) -> float:
 
 def node_launch(chain: BeadChain) -> Launch:
     """Internal and gathered forces, closure and the step of every fiber."""
-    model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
+    if chain.native_nodes and native_nodes_apply(chain.model, node_features(chain)):
+        return native_node_launch(chain)
+    return plain_node_launch(chain)
+
+
+def node_features(chain: BeadChain) -> NodeFeatures:
+    """What the node sweep of this chain contains."""
+    model = chain.model
     closure = chain.scene.numerics.closure
     if all(abs(row["spacing"] - 1.0) < 1e-12 for row in model.group_rows):
         closure = "none"  # every factor is 1 and A is the identity
-    features = NodeFeatures(
+    return NodeFeatures(
         closure=closure,
-        pairs=chain.pair_features.storage if pairs is not None else "none",
+        pairs=chain.pair_features.storage if chain.list is not None else "none",
         walls=model.domain.wall if chain.strength > 0.0 else (False, False, False),
         gravity=chain.scene.gravity is not None,
     )
+
+
+def plain_node_launch(chain: BeadChain) -> Launch:
+    """The node sweep with one thread per fiber."""
+    model = chain.model
+    sweep = make_node_sweep(model.precision.name, node_features(chain))
+    return Launch("nodes", sweep, model.fiber_count, _node_inputs(chain), split=True)
+
+
+def native_node_launch(chain: BeadChain) -> Launch:
+    """The node sweep with one SIMD block per thread; a block is never split between workers."""
+    model, pairs = chain.model, chain.list
+    name = model.precision.name
+    fibers, own = fiber_blocks(model.host["fiber_group"], LANES[name])
+    none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
+    inputs = [
+        *_node_inputs(chain),
+        pairs.pair_i if pairs else none_i,
+        pairs.pair_j if pairs else none_i,
+        wp.array(fibers.ravel(), dtype=wp.int32, device=model.device),
+        wp.array(own, dtype=wp.int32, device=model.device),
+    ]
+    sweep = make_native_node_sweep(name, node_features(chain))
+    return Launch("nodes", sweep, len(own), inputs, split=True)
+
+
+def _node_inputs(chain: BeadChain) -> list[Any]:
+    """Arguments that every node sweep takes."""
+    model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     low = np.asarray(model.domain.low)
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
-    return Launch(
-        "nodes",
-        make_node_sweep(p.name, features),
-        model.fiber_count,
-        [
-            p.real(chain.dt),
-            p.vec3(*chain.flow_origin),
-            p.vec3(*low),
-            p.vec3(*(low + np.asarray(model.domain.size))),
-            p.real(chain.strength),
-            p.real(chain.decay),
-            p.real(pairs.reach + pairs.skin if pairs else 0.0),
-            p.real(pairs.skin if pairs else 0.0),
-            p.real(pairs.stretch_allowed if pairs else 0.0),
-            model.groups,
-            model.pivots,
-            model.fiber_node_start,
-            model.fiber_group,
-            state.gradient,
-            state.deformation,
-            pairs.out_start if pairs else none_i,
-            pairs.in_start if pairs else none_i,
-            pairs.in_pair if pairs else none_i,
-            chain.pair_acts,
-            chain.pair_force,
-            chain.pair_closest,
-            chain.pair_arm_i,
-            chain.pair_arm_j,
-            state.list_pos,
-            state.node_pos,
-            state.node_velocity,
-            state.node_force,
-            state.status,
-        ],
-        split=True,
-    )
+    return [
+        p.real(chain.dt),
+        p.vec3(*chain.flow_origin),
+        p.vec3(*low),
+        p.vec3(*(low + np.asarray(model.domain.size))),
+        p.real(chain.strength),
+        p.real(chain.decay),
+        p.real(pairs.reach + pairs.skin if pairs else 0.0),
+        p.real(pairs.skin if pairs else 0.0),
+        p.real(pairs.stretch_allowed if pairs else 0.0),
+        model.groups,
+        model.pivots,
+        model.fiber_node_start,
+        model.fiber_group,
+        state.gradient,
+        state.deformation,
+        pairs.out_start if pairs else none_i,
+        pairs.in_start if pairs else none_i,
+        pairs.in_pair if pairs else none_i,
+        chain.pair_acts,
+        chain.pair_force,
+        chain.pair_closest,
+        chain.pair_arm_i,
+        chain.pair_arm_j,
+        state.list_pos,
+        state.node_pos,
+        state.node_velocity,
+        state.node_force,
+        state.status,
+    ]

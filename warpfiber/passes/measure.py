@@ -322,7 +322,7 @@ def make_measure_terms(name: str, pairs: str):
         first = fiber_node_start[fiber]
         spin = flow_spin(gradient[0])
         n0 = vec3(real(0.0), real(0.0), real(0.0))
-        d0 = real(1.0)
+        inverse0 = real(1.0)
         for k in range(g.segments + 1):
             i = first + k
             x = node_pos[i]
@@ -332,12 +332,14 @@ def make_measure_terms(name: str, pairs: str):
             if k < g.segments:
                 edge = node_pos[i + 1] - x
                 d1 = wp.length(edge)
-                n1 = edge / d1
+                inverse1 = real(1.0) / d1
+                n1 = inverse1 * edge
                 keep_largest(0, stretching_force(g.stretching, d1, g.rest, n1), terms_out)
                 if k > 0:
-                    before, after = bending_forces(g.bending, n0, d0, n1, d1)
+                    before, after = bending_forces(g.bending, n0, inverse0, n1, inverse1)
                     keep_largest(1, before + after, terms_out)
-                couple = torque_couple(g.torque * g.weight, n1, d1, node_velocity[i + 1] - v, spin)
+                dv = node_velocity[i + 1] - v
+                couple = torque_couple(g.torque * g.weight, n1, inverse1, dv, spin)
                 keep_largest(2, couple, terms_out)
                 if wp.static(has_pairs):
                     segment = i - fiber
@@ -349,6 +351,6 @@ def make_measure_terms(name: str, pairs: str):
                         if pair_acts[pair] != wp.uint8(0):
                             keep_largest(3, pair_force[pair], terms_out)
                 n0 = n1
-                d0 = d1
+                inverse0 = inverse1
 
     return measure_terms

@@ -1,7 +1,8 @@
 """One sweep over fibers: gather pair forces, add drag and internal forces, close, integrate.
 
 One thread walks along one fiber. First walk: stretching, bending, hydrodynamic torque, walls and
-the gathered pair forces give the non-distributed force of every node. Second walk: the closure
+the gathered pair forces give the non-distributed force of every node; the Galerkin closure
+eliminates forward on the way. Second walk, backward where the closure substitutes: the closure
 turns node forces into accelerations and the step (velocity first, with the drag at the middle of
 the step, then position with the new velocity) moves the nodes. A fiber that is torn or not finite
 is left as it is and reported.
@@ -59,6 +60,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
     has_pairs = features.pairs != "none"
     has_arms = features.pairs == "arms"
     wall_x, wall_y, wall_z = features.walls
+    has_walls = any(features.walls)
     has_gravity = features.gravity
     is_paper = features.closure == "paper"
     is_consistent = features.closure == "consistent"
@@ -181,7 +183,8 @@ def make_node_sweep(name: str, features: NodeFeatures):
         x0 = node_pos[first]
         v0 = node_velocity[first]
         n0 = vec3(zero, zero, zero)
-        d0 = one
+        inverse0 = one
+        y = vec3(zero, zero, zero)
         longest = zero
         center = x0
         sum_first = vec3(zero, zero, zero)
@@ -192,17 +195,19 @@ def make_node_sweep(name: str, features: NodeFeatures):
             v1 = node_velocity[i + 1]
             edge = x1 - x0
             d1 = wp.length(edge)
-            n1 = edge / d1
-            if not (d1 < tear * g.rest):
-                longest = two * tear * g.rest
-            longest = wp.max(longest, d1)
+            inverse1 = one / d1
+            n1 = inverse1 * edge
+            if not (d1 <= longest):
+                longest = d1
+                if not (d1 < tear * g.rest):
+                    longest = two * tear * g.rest
 
             weight = g.weight
             if k == 0:
                 weight += g.weight_excess
             if k == segments - 1:
                 weight += g.weight_excess
-            couple = torque_couple(g.torque * weight, n1, d1, v1 - v0, spin)
+            couple = torque_couple(g.torque * weight, n1, inverse1, v1 - v0, spin)
             pull = stretching_force(g.stretching, d1, g.rest, n1)
             f_here += pull - couple
             f_after = couple - pull
@@ -221,13 +226,18 @@ def make_node_sweep(name: str, features: NodeFeatures):
                 f_here += total - second
                 f_after += second
             if k > 0:
-                before, after = bending_forces(g.bending, n0, d0, n1, d1)
+                before, after = bending_forces(g.bending, n0, inverse0, n1, inverse1)
                 f_before += before
                 f_here -= before + after
                 f_after += after
-                node_force_out[i - 1] = f_before + wall_force(
-                    node_pos[i - 1], g.radius, wall_low, wall_high, strength, decay
-                )
+                if wp.static(has_walls):
+                    f_before += wall_force(
+                        node_pos[i - 1], g.radius, wall_low, wall_high, strength, decay
+                    )
+                if wp.static(is_consistent):
+                    y = pivots[g.pivot_start + k - 1] * (f_before - g.coupling * y)
+                    f_before = y
+                node_force_out[i - 1] = f_before
             if wp.static(is_paper):
                 center += x1
                 sum_first += real(segments - k) * n1
@@ -237,30 +247,23 @@ def make_node_sweep(name: str, features: NodeFeatures):
             x0 = x1
             v0 = v1
             n0 = n1
-            d0 = d1
-        node_force_out[last - 1] = f_before + wall_force(
-            node_pos[last - 1], g.radius, wall_low, wall_high, strength, decay
-        )
-        node_force_out[last] = f_here + wall_force(
-            x0, g.radius, wall_low, wall_high, strength, decay
-        )
+            inverse0 = inverse1
+        if wp.static(has_walls):
+            f_before += wall_force(
+                node_pos[last - 1], g.radius, wall_low, wall_high, strength, decay
+            )
+            f_here += wall_force(x0, g.radius, wall_low, wall_high, strength, decay)
+        if wp.static(is_consistent):
+            f_before = pivots[g.pivot_start + segments - 1] * (f_before - g.coupling * y)
+            f_here = pivots[g.pivot_start + segments] * (f_here - g.coupling * f_before)
+        node_force_out[last - 1] = f_before
+        node_force_out[last] = f_here
         if not (longest < tear * g.rest):
             status[wp.static(TORN)] = 1
             status[wp.static(BAD_FIBER)] = fiber
             return
 
-        # Second walk: closure. With `consistent`, `node_force_out` becomes A^-1 F^ND.
-        if wp.static(is_consistent):
-            y = node_force_out[first] * pivots[g.pivot_start]
-            node_force_out[first] = y
-            for k in range(1, segments + 1):
-                y = (node_force_out[first + k] - g.coupling * y) * pivots[g.pivot_start + k]
-                node_force_out[first + k] = y
-            for k in range(1, segments + 1):
-                i = last - k
-                y = node_force_out[i] - g.coupling * pivots[g.pivot_start + segments - k] * y
-                node_force_out[i] = y
-
+        # Second walk: closure and step.
         n_seg = real(segments)
         alpha_r = one
         alpha_t = one
@@ -293,7 +296,11 @@ def make_node_sweep(name: str, features: NodeFeatures):
         partial = vec3(zero, zero, zero)
         n_before = vec3(zero, zero, zero)
         n_after = vec3(zero, zero, zero)
-        for k in range(segments + 1):
+        y = vec3(zero, zero, zero)
+        for at in range(segments + 1):
+            k = at
+            if wp.static(is_consistent):
+                k = segments - at
             i = first + k
             x = node_pos[i]
             v = node_velocity[i]
@@ -301,6 +308,10 @@ def make_node_sweep(name: str, features: NodeFeatures):
             if wp.static(has_gravity):
                 distributed += g.body_force
             force = node_force_out[i]
+            if wp.static(is_consistent):
+                if at > 0:
+                    force -= (g.coupling * pivots[g.pivot_start + k]) * y
+                y = force
             if wp.static(is_paper):
                 if k < segments:
                     n_after = wp.normalize(node_pos[i + 1] - x)
@@ -327,7 +338,9 @@ def make_node_sweep(name: str, features: NodeFeatures):
             node_pos[i] = x
             if wp.static(has_pairs):
                 moved = x - flow_origin - affine * (list_pos[i] - flow_origin)
-                furthest = wp.max(furthest, wp.length_sq(moved))
+                distance2 = wp.length_sq(moved)
+                if distance2 > furthest:
+                    furthest = distance2
         if wp.static(has_pairs):
             if limit < zero or furthest > limit * limit:
                 status[wp.static(EXPIRED)] = 1

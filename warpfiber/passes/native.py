@@ -1,0 +1,57 @@
+"""C++ text that SIMD blocks share: vector types, a transpose in registers, three-vectors of lanes.
+
+A SIMD block is a `wp.func_native`, for the CPU only: clang vector types with plain arithmetic, one
+lane per item, no intrinsics. Every block repeats laws that stay in Warp and is tested against them.
+"""
+
+from warpfiber.model import precision
+
+LANES = {"float32": 16, "float64": 8}  # 64 bytes
+
+
+def lane_types(name: str) -> str:
+    """Real T, vector V of W lanes, U the same at any address, mask M, vector triple V3."""
+    real = {"float32": "float", "float64": "double"}[precision(name).name]
+    return f"""
+    using T = {real};
+    constexpr int W = {LANES[name]};
+    typedef T V __attribute__((ext_vector_type(W)));
+    typedef T U __attribute__((ext_vector_type(W), aligned(sizeof(T))));
+    typedef decltype(V() < V()) M;
+    struct V3 {{
+        V x, y, z;
+        V3 operator+(const V3& b) const {{ return {{x + b.x, y + b.y, z + b.z}}; }}
+        V3 operator-(const V3& b) const {{ return {{x - b.x, y - b.y, z - b.z}}; }}
+        V3 operator*(V s) const {{ return {{x * s, y * s, z * s}}; }}
+        V dot(const V3& b) const {{ return x * b.x + y * b.y + z * b.z; }}
+        V3 cross(const V3& b) const {{
+            return {{y * b.z - z * b.y, z * b.x - x * b.z, x * b.y - y * b.x}};
+        }}
+    }};
+    auto lanes_of = [](T s) -> V {{ return V(s); }};
+    auto same3 = [](T x, T y, T z) -> V3 {{ return V3{{V(x), V(y), V(z)}}; }};
+    auto any = [](M m) -> bool {{ return __builtin_reduce_or(m) != 0; }};
+"""
+
+
+def transpose(lanes: int, rows: str = "r") -> str:
+    """Statements that transpose the square `rows[lanes]` of vectors in place, log2(lanes) stages.
+
+    A stage with distance h swaps the off-diagonal h x h parts of every 2h x 2h part.
+    """
+    lines = []
+    distance = 1
+    while distance < lanes:
+        for i in range(lanes):
+            if i & distance:
+                continue
+            low = [n if not n & distance else lanes + n - distance for n in range(lanes)]
+            high = [n + distance if not n & distance else lanes + n for n in range(lanes)]
+            a, b = f"{rows}[{i}]", f"{rows}[{i + distance}]"
+            lines.append(
+                f"{{ V a = {a}, b = {b};"
+                f" {a} = __builtin_shufflevector(a, b, {', '.join(map(str, low))});"
+                f" {b} = __builtin_shufflevector(a, b, {', '.join(map(str, high))}); }}"
+            )
+        distance *= 2
+    return "\n".join(lines)
