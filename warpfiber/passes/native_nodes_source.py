@@ -62,7 +62,7 @@ _TRANSFER = """
     bool in_row = true;
     for (int l = 1; l < own; ++l) in_row &= first[l] == first[l - 1] + segments + 1;
     const long row_end = 3L * first[own - 1] + size;
-    auto load = [&](V* to, const T* from) {
+    auto load = [&](V* to, const T* from) __attribute__((noinline)) {
         bool wide = true;
         for (int l = 0; l < W; ++l) wide &= 3L * first[l] + W <= array_end;
         if (size < W && !wide) {
@@ -80,7 +80,7 @@ _TRANSFER = """
             for (int l = 0; l < W; ++l) to[at + l] = r[l];
         }
     };
-    auto store = [&](T* to, const V* from, unsigned keep) {
+    auto store = [&](T* to, const V* from, unsigned keep) __attribute__((noinline)) {
         int done = 0;  // short fibers that are written
         if (size >= W || (in_row && keep == all)) {
             if (size < W)
