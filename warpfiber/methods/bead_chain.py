@@ -82,6 +82,7 @@ class BeadChain:
                 skin=skin,
                 longest_rest=longest,
                 stretch=float(self._segment_stretch().max()),
+                workers=self.workers,
             )
             self.check_box()
         self._allocate_pair_results()
@@ -220,6 +221,8 @@ class BeadChain:
     def close(self) -> None:
         """Stop worker threads."""
         self._stop_executor()
+        if self.list is not None:
+            self.list.close()
 
     def _stop_executor(self) -> None:
         if self.executor is not None:
