@@ -22,6 +22,8 @@ RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
 MEMORY = 0.5  # weight of the use before in the mean
+# Measured: listed pairs grow with the volume from this part of the distance in contact on.
+CORE = 0.85
 
 
 @dataclass
@@ -29,10 +31,12 @@ class SkinChoice:
     """Skin of a list from build to build; lengths in run units."""
 
     skin: float
+    start: float
     largest: float  # that the box allows
     least: float
+    radius: float  # the largest
     reach: float
-    core: float  # centers of segments do not come nearer than this
+    core: float  # distance of center lines in contact
     length: float  # mean length of a segment
     pieces_per_segment: float
     fixed: bool = False
@@ -76,10 +80,10 @@ class SkinChoice:
 
     def cost(self, skin: float, pairs_per_segment: float) -> float:
         """ns per segment-step, with `pairs_per_segment` at the present skin."""
-        core = self.volume(self.core)
+        core = self.volume(CORE * self.core)
         now = self.volume(self.reach + self.skin) - core
         pairs = pairs_per_segment * (self.volume(self.reach + skin) - core) / now
-        near = self._around(skin) / self._around(self.core * START_SKIN)
+        near = self._around(skin) / self._around(2.0 * START_SKIN * self.radius)
         build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * near)
         return build / max(1.0, skin / self.use) + PAIR_COST * pairs
 
@@ -95,9 +99,13 @@ class SkinChoice:
 
     def mean(self, step: int) -> float:
         """Mean skin over the steps so far."""
-        now = max(0, step - self.built_step)
-        steps = self.steps + now
+        steps = self.steps_counted(step)
+        now = steps - self.steps
         return (self.skin_steps + now * self.skin) / steps if steps else self.skin
+
+    def steps_counted(self, step: int) -> int:
+        """Steps since this choice began, in this process."""
+        return self.steps + max(0, step - self.built_step)
 
     def saved(self) -> np.ndarray:
         """What a continued run needs to choose the same."""

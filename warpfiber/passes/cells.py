@@ -17,8 +17,8 @@ from warpfiber.passes.pairs import IMAGE_BITS, image_code
 
 MAX_CELLS_PER_PIECE = 4
 # Widths of a cell in the largest distance of midpoints that can be near, along and across a row.
-# Measured at 20,000 segments: long thin cells (0.25, 0.6) hold 1.7 times fewer midpoints but cost 1.3
-# times more, since their runs are shorter than a vector.
+# Measured at 20,000 segments: (0.25, 0.6) finds 1.7 times fewer midpoints but takes 1.3 times as
+# long, since its runs are shorter than a vector.
 CELL_LENGTH, CELL_WIDTH = 0.1, 1.3
 MOST_CELLS = 2000.0  # along one axis: a float32 still tells cells apart to a thousandth
 GEOMETRY_PLANES = 7  # midpoint, half axis, half length

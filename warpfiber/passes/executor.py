@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,7 +83,7 @@ class Call:
 class Executor:
     """Replays the steps made of `launches`."""
 
-    def __init__(self, launches: list[Launch | Call], device: str, workers: int = 1) -> None:
+    def __init__(self, launches: Sequence[Launch | Call], device: str, workers: int = 1) -> None:
         self.launches = [launch for launch in launches if launch.dim > 0]
         self.device = device
         self.workers = max(1, workers)

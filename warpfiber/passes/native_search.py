@@ -196,7 +196,9 @@ _CODE = f"({NO_WRAP} + (nx) + {WRAP_Y} * (ny) + {WRAP_Z} * (nz))"
 
 def _search_text(periodic: tuple[bool, bool, bool]) -> str:
     text = SEARCH.replace("CODE(nx, ny, nz)", _CODE).replace("NO_WRAP", str(NO_WRAP))
-    text = text.replace("LANES", str(LANES)).replace("MASK", {8: "unsigned char", 16: "unsigned short"}[LANES])
+    text = text.replace("LANES", str(LANES)).replace(
+        "MASK", {8: "unsigned char", 16: "unsigned short"}[LANES]
+    )
     text = text.replace("ROUNDING", f"{ROUNDING}f").replace("PARALLEL", f"{PARALLEL}f")
     for axis, wraps in zip("XYZ", periodic, strict=True):
         text = text.replace(f"WRAPS_{axis}", str(int(wraps)))

@@ -82,7 +82,7 @@ class NeighborList:
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
         features = ListFeatures(domain.periodic, domain.shear_axes, domain.sheared, has_pieces)
-        self.kernels = make_cell_kernels(name, features)
+        self.kernels = dict(make_cell_kernels(name, features))  # the one made is shared
         if self.native:
             self.kernels |= make_search_kernels(name, domain.periodic, has_pieces)
             self.kernels |= make_sort_kernels()
@@ -223,7 +223,9 @@ class NeighborList:
         return tuple(a.numpy()[:n].copy() for a in (self.pair_i, self.pair_j, self.pair_image))
 
     def search_counts(self) -> dict[str, int]:
-        """What the last native build looked at: midpoints in cells, pieces compared, law calls."""
+        """What the last build looked at: midpoints in cells, pieces compared, law; native only."""
+        if not self.native:
+            return {}
         seen, compared = self.tally.numpy().reshape(-1, 2).sum(axis=0)
         confirmed = int(self.found_count.numpy().sum())
         return {"in_cells": int(seen), "compared": int(compared), "confirmed": confirmed}
