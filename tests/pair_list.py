@@ -12,6 +12,7 @@ import numpy as np
 
 from tests.cell import Kind, bent_fiber, listed_pairs
 from tests.reference import segments as sg
+from warpfiber.passes.neighbors import NeighborList
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
@@ -55,12 +56,34 @@ def brute_force(sim: Simulation, reach: float) -> Pairs:
     return rows
 
 
+def plain_list(pairs: NeighborList) -> NeighborList:
+    """The list of the present state by the kernels that also run on CUDA."""
+    plain = NeighborList(
+        pairs.model,
+        pairs.state,
+        reach=pairs.reach,
+        skin=pairs.skin,
+        longest_rest=pairs.longest_rest,
+        native=False,
+    )
+    plain.set_stretch(pairs.stretch_allowed)
+    plain.build(wrap=False)
+    return plain
+
+
 def check_list(sim: Simulation, least: int = 1) -> Pairs:
-    """The list holds exactly what is within reach + skin."""
+    """The list holds exactly what is within reach + skin; the plain kernels make the same one."""
     pairs = sim.method.list
     assert pairs is not None
     listed = listed_pairs(sim)
     assert listed == brute_force(sim, pairs.reach + pairs.skin)
+    plain = plain_list(pairs)
+    for name in ("out_start", "in_start"):
+        assert (getattr(plain, name).numpy() == getattr(pairs, name).numpy()).all()
+    n = len(listed)
+    assert plain.pair_count == n
+    for name in ("pair_i", "pair_j", "pair_image", "in_pair"):
+        assert (getattr(plain, name).numpy()[:n] == getattr(pairs, name).numpy()[:n]).all()
     assert len(listed) >= least
     return listed
 

@@ -28,7 +28,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfiber.passes.cells import ListFeatures, make_list_kernels
+from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.measure import (
     MeasureFeatures,
@@ -38,6 +38,7 @@ from warpfiber.passes.measure import (
 )
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.rows import make_row_kernels
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
@@ -166,10 +167,12 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         "layer": ListFeatures((True, True, False)),
         "sheared": ListFeatures((True, True, True), (0, 2), True),
         "deformed": ListFeatures((True, True, True), None, True),
+        "pieces": ListFeatures((True, True, True), (0, 2), True, True),
     }
     for variant, features in lists.items():
-        for name, kernel in make_list_kernels(precision, features).items():
-            yield name, variant, kernel
+        for make in (make_cell_kernels, make_row_kernels):
+            for name, kernel in make(precision, features).items():
+                yield name, variant, kernel
     for variant, fibers in {
         "orientation": MeasureFeatures(),
         "everything": MeasureFeatures(orientation4=True, energy=True, curvature=True),

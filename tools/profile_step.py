@@ -60,7 +60,7 @@ def profile(args: argparse.Namespace) -> None:
     for name, time, launch in rows:
         moved = bytes_moved(launch, method.list)
         limit = copy_bandwidth(moved // 2) / 1e9 if on_cpu else float("nan")
-        rate = moved / max(time, 1e-12) / 1e9
+        rate = moved / time / 1e9 if time > 0.0 else float("nan")
         print(
             f"{name:10}{time * 1e6:10.1f}{time / count * 1e9:9.1f}{time / whole:8.1%}"
             f"{moved / count:8.0f}{rate:8.1f}{limit:8.1f}"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from warpfiber.methods.bead_chain import LIST_SKIN, contact_reach
+from warpfiber.methods.bead_chain import contact_reach
 from warpfiber.methods.box_limits import bearable_strain
+from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import chosen_step, step_limits
 from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
@@ -56,7 +57,7 @@ def box_strain_limit(scene: Scene) -> float:
     if contact_reach(scene) == 0.0:
         return math.inf
     diameter = max(group.diameter for group in scene.fibers)
-    skin = LIST_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
+    skin = START_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
     longest = CELL_SLACK * FIRST_STRETCH * longest_segment(scene)
     return bearable_strain(scene, longest + contact_reach(scene) * diameter + skin)
 
@@ -104,7 +105,7 @@ def check_lines(scene: Scene) -> list[str]:
         rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
     if contact_reach(scene) > 0.0:
         skin = scene.numerics.skin
-        text = f"auto, {LIST_SKIN} diameters" if skin is None else f"{skin:.3g} m"
+        text = f"auto, starts with {START_SKIN} diameters" if skin is None else f"{skin:.3g} m"
         rows.append(("neighbor list skin", text))
         limit_strain = box_strain_limit(scene)
         if math.isfinite(limit_strain):

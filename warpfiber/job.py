@@ -164,8 +164,18 @@ class Job:
         failed = (self.summary.failure or {}).get("outcome", "diverged")
         outcome = {0: "finished", 3: failed, 130: "interrupted", 143: "stopped"}[code]
         self.folder.write_summary(self.summary.as_dict(self, outcome))
+        self._log_list()
         self.folder.log(f"{outcome} at step {self.simulation.step_count}")
         return code
+
+    def _log_list(self) -> None:
+        report = self.simulation.method.list_report()
+        if report:
+            self.folder.log(
+                f"neighbor list: skin {report['skin_diameters']:.3g} diameters at the end, "
+                f"{report['skin_mean_diameters']:.3g} in the mean; {report['builds']} builds, "
+                f"{report['steps_per_build']:.4g} steps each; {report['pairs']} pairs listed"
+            )
 
     def _advance_to_event(self, stopper: Stopper) -> int:
         """Run until the next row, frame or end of stage is due, or a stop is asked for."""

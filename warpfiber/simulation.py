@@ -268,8 +268,9 @@ class Simulation:
         """Copies of every array that the next step depends on, in run units and full precision."""
         self.method.prepare()
         arrays = {name: getattr(self.state, name).numpy().copy() for name in _ARRAYS}
-        if self.method.list is not None:
+        if self.method.list is not None and self.method.skin is not None:
             arrays["stretch_allowed"] = np.asarray(self.method.list.stretch_allowed)
+            arrays["skin"] = self.method.skin.saved()
         if self.measurement.angle is not None:
             arrays["angle"] = self.measurement.angle.copy()
         return arrays
@@ -280,12 +281,14 @@ class Simulation:
         state.status.fill_(0)
         for name in _ARRAYS:
             getattr(state, name).assign(arrays[name])
-        if self.method.list is not None:
+        if self.method.list is not None and self.method.skin is not None:
             # the list of the snapshot was built from other positions: build the same one again
             self.method.set_stretch(float(arrays["stretch_allowed"]))
+            self.method.set_skin(float(arrays["skin"][0]))
             state.node_pos.assign(arrays["list_pos"])
             state.lattice.assign(arrays["list_lattice"])
             self.method.refresh_list(wrap=False)
+            self.method.skin.restore(arrays["skin"])
             for name in ("node_pos", "lattice", "deformation"):
                 getattr(state, name).assign(arrays[name])
         self.method.set_gradient()

@@ -105,6 +105,7 @@ class Summary:
                 "list_builds": pairs.build_count if pairs else 0,
                 "list_growths": pairs.grow_count if pairs else 0,
             },
+            "list": simulation.method.list_report(),
             "steps": simulation.step_count,
             "dt": simulation.dt,
             "dt_limit": simulation.limits[0].dt,

@@ -88,9 +88,11 @@ def test_a_kernel_without_cubin_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_every_pass_is_compiled_in_both_precisions() -> None:
-    from warpfiber.passes.cells import ListFeatures, make_list_kernels
+    from warpfiber.passes.cells import ListFeatures, make_cell_kernels
+    from warpfiber.passes.rows import make_row_kernels
 
-    listed = make_list_kernels("float32", ListFeatures((True, True, True)))
+    features = ListFeatures((True, True, True))
+    listed = make_cell_kernels("float32", features) | make_row_kernels("float32", features)
     names = {kernel for kernel, _, _ in tool.kernels("float32")}
     assert names == {
         *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),

@@ -103,11 +103,11 @@ def test_wrapped_positions(start: Start) -> None:
     ],
 )
 def test_small_boxes(start: Start, edges: list[float], kind: Kind, count: int) -> None:
-    """Boxes of one or two cells: two images of one pair can both be near."""
+    """Boxes of one or two rows of cells: two images of one pair can both be near."""
     fibers, _ = random_fibers((kind,), count, edges, seed=7, spread=0.3)
     sim = cell(start, (kind,), fibers, box={"size": edges})
     cells = sim.method.list.cells.numpy()[0]
-    assert cells.min() == 1
+    assert cells.min() <= 2
     listed = check_list(sim, least=5)
     pairs = [(i, j) for i, j, _ in listed]
     assert any(i == j or pairs.count((i, j)) > 1 for i, j in pairs) or count > 3
@@ -176,7 +176,8 @@ def test_other_lattices(start: Start, gradient: list[list[float]]) -> None:
     assert np.abs(lattice - expected @ np.diag(edges)).max() < 1e-11 * 40
 
 
-def test_capacities_grow(start: Start) -> None:
+@pytest.mark.parametrize(("native", "workers"), [(False, 1), (True, 1), (True, 2), (True, 3)])
+def test_capacities_grow(start: Start, native: bool, workers: int) -> None:
     """Rows and pairs that start at one grow until everything fits: the same list."""
     fibers, which = random_fibers(MIXED, 90, [40.0] * 3, seed=2)
     sim = cell(start, MIXED, fibers, which, box={"size": [40.0] * 3})
@@ -191,14 +192,17 @@ def test_capacities_grow(start: Start) -> None:
         longest_rest=roomy.longest_rest,
         row_capacity=1,
         pair_capacity=1,
+        native=native,
+        workers=workers,
     )
     assert tight.build()
-    assert tight.grow_count >= 2
+    assert tight.grow_count >= (1 if native else 2)
     assert tight.pair_count == len(expected[0]) > 100
     for got, want in zip(tight.host_pairs(), expected, strict=True):
         assert (got == want).all()
     for name in ("out_start", "in_start"):
         assert (getattr(tight, name).numpy() == getattr(roomy, name).numpy()).all()
+    tight.close()
 
 
 @pytest.mark.parametrize("orientation", ["isotropic", "planar", "aligned"])

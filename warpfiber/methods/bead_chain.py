@@ -18,9 +18,10 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
-from warpfiber.methods.box_limits import bearable_strain
+from warpfiber.methods.box_limits import bearable_strain, lasting_height
+from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
-from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
+from warpfiber.model import BAD_FIBER, EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
 from warpfiber.passes.executor import Executor
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
@@ -31,7 +32,6 @@ from warpfiber.scene import Scene
 
 # Below this many segments the hand-off between workers costs more than it saves.
 WORKER_BREAK_EVEN = 5000
-LIST_SKIN = 0.3  # diameters
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 STRETCH_GROWTH = 1.2  # how much longer segments may be after they outgrew the cells of the list
 
@@ -68,13 +68,14 @@ class BeadChain:
             sheared=domain.sheared,
         )
         self.list: NeighborList | None = None
+        self.skin: SkinChoice | None = None
         self.list_seconds = 0.0
         self.strain_end = math.inf  # where a deforming box becomes too flat
         self.set_gradient()
         if self.has_pairs:
             largest = max(row["radius"] for row in model.group_rows)
             longest = max(row["rest"] for row in model.group_rows)
-            skin = LIST_SKIN * 2.0 * largest
+            skin = START_SKIN * 2.0 * largest
             if scene.numerics.skin is not None:
                 skin = scene.numerics.skin / units.length
             self.list = NeighborList(
@@ -84,7 +85,9 @@ class BeadChain:
                 skin=skin,
                 longest_rest=longest,
                 stretch=float(self._segment_stretch().max()),
+                workers=self.workers,
             )
+            self.skin = self._skin_choice(skin, largest)
             self.check_box()
         self._allocate_pair_results()
         self.native_nodes = True  # the SIMD node sweep where it applies; read by `prepare`
@@ -103,6 +106,32 @@ class BeadChain:
         except AttributeError:  # only Linux tells which cores this process may use
             cores = os.cpu_count() or 1
         return min(2, cores)
+
+    def _skin_choice(self, skin: float, largest: float) -> SkinChoice:
+        """The start skin, and between what it may change."""
+        assert self.list is not None
+        rows, pairs = self.model.group_rows, self.list
+        counts = np.bincount(self.model.host["fiber_group"], minlength=len(rows))
+        segments = counts * np.asarray([row["segments"] for row in rows])
+        return SkinChoice(
+            skin=skin,
+            start=skin,
+            radius=largest,
+            largest=self._largest_skin(skin, largest),
+            least=min(skin, 2.0 * LEAST_SKIN * largest),
+            reach=pairs.reach,
+            core=2.0 * min(row["radius"] for row in rows),
+            length=float(np.average([row["rest"] for row in rows], weights=segments)),
+            pieces_per_segment=pairs.piece_count / self.model.segment_count,
+            fixed=self.scene.numerics.skin is not None,
+        )
+
+    def _largest_skin(self, start: float, radius: float) -> float:
+        """What a lasting box has room for; a box that is flattened keeps the start skin."""
+        assert self.list is not None
+        room = lasting_height(self.scene) / self.model.units.length
+        room -= self.list.cell_width - self.list.skin
+        return max(start, min(2.0 * MOST_SKIN * radius, room * (1.0 - 1e-9)))
 
     def _segment_stretch(self) -> np.ndarray:
         """(S,) length of every segment now, in its rest length."""
@@ -150,10 +179,20 @@ class BeadChain:
 
     def set_stretch(self, stretch: float) -> None:
         """Take over the stretch that a saved run's list allowed; the next list and step use it."""
-        assert self.list is not None
-        self.list.set_stretch(stretch)
+        pairs, choice = self.list, self.skin
+        assert pairs is not None and choice is not None
+        pairs.set_stretch(stretch)
+        choice.largest = self._largest_skin(choice.start, choice.radius)
+        self.set_skin(min(choice.skin, choice.largest))
         self.check_box()
         self._stop_executor()
+
+    def set_skin(self, skin: float) -> None:
+        """Take over a skin; the next list and step use it."""
+        assert self.list is not None and self.skin is not None
+        self.skin.set_skin(skin)
+        if skin != self.list.skin:
+            self.list.set_skin(skin)
 
     def time_passes(self, steps: int) -> dict[str, float]:
         """Seconds per step of every launch and of the list, over `steps` steps of the run."""
@@ -170,9 +209,28 @@ class BeadChain:
         begin = time.perf_counter()
         replaced = self.list.build(wrap=wrap)
         self.list_seconds += time.perf_counter() - begin
+        assert self.skin is not None
+        self.skin.built(self.step_count)
         if replaced:
             self._allocate_pair_results()
             self._stop_executor()
+
+    def list_report(self) -> dict[str, float]:
+        """Skins in largest diameters, builds and what they looked at; nothing without a list."""
+        pairs, choice = self.list, self.skin
+        if pairs is None or choice is None:
+            return {}
+        diameter, step = 2.0 * choice.radius, self.step_count
+        report: dict[str, float] = {
+            "skin_diameters": round(choice.skin / diameter, 4),
+            "skin_mean_diameters": round(choice.mean(step) / diameter, 4),
+            "builds": pairs.build_count,
+            "growths": pairs.grow_count,
+            "steps_per_build": round(choice.steps_counted(step) / max(1, pairs.build_count), 2),
+            "pairs": pairs.pair_count,
+            "pieces": pairs.piece_count,
+        }
+        return report | pairs.search_counts()
 
     def prepare(self) -> None:
         """Compile, build the first list and capture, so that the next `advance` only steps."""
@@ -201,6 +259,9 @@ class BeadChain:
         if stretched and self.list is not None:
             self.set_stretch(STRETCH_GROWTH * self.list.stretch_allowed)
             self.state.status.zero_()
+        elif expired and self.list is not None and self.skin is not None:
+            listed = float(status[PAIR_COUNT]) / self.model.segment_count
+            self.set_skin(self.skin.choose(self.step_count, listed))
         if expired or stretched:
             self.refresh_list()
         return True
@@ -223,6 +284,8 @@ class BeadChain:
     def close(self) -> None:
         """Stop worker threads."""
         self._stop_executor()
+        if self.list is not None:
+            self.list.close()
 
     def _stop_executor(self) -> None:
         if self.executor is not None:

@@ -51,6 +51,21 @@ def bearable_strain(scene: Scene, width: float) -> float:
     return end
 
 
+def lasting_height(scene: Scene) -> float:
+    """Height (m) that the scene's box keeps everywhere for good; 0 if its flow flattens it."""
+    box, flow = scene.box, scene.flow
+    if box is None:
+        return math.inf
+    size = np.asarray(box.size)
+    wraps = [kind == "periodic" for kind in box.boundary]
+    if all(wraps) and flow is not None and flow.rate > 0.0:
+        entries = np.argwhere(np.asarray(flow.velocity_gradient) != 0.0)
+        if len(entries) != 1 or entries[0][0] == entries[0][1]:
+            return 0.0
+        return _smallest_sheared_height(size, (int(entries[0][0]), int(entries[0][1])))
+    return float(min(size[wraps], default=math.inf))
+
+
 def _smallest_sheared_height(size: np.ndarray, axes: tuple[int, int]) -> float:
     """Smallest height of a box that is reset at half a box of shear."""
     lattice = np.diag(size)

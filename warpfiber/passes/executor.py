@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,10 +59,31 @@ class Launch:
         load_kernel(self.kernel, device)
 
 
+@dataclass
+class Call:
+    """What Warp records like a launch but is none: a sort, a scan. The first worker runs it."""
+
+    name: str
+    function: Callable[[], None]
+    dim: int = 1
+
+    def part(self, worker: int, workers: int) -> tuple[int, int]:
+        """First item and number of items of one worker."""
+        return 0, self.dim if worker == 0 else 0
+
+    def run(self, device: str, worker: int = 0, workers: int = 1) -> None:
+        """Call it if this worker does."""
+        if worker == 0:
+            self.function()
+
+    def load(self, device: str) -> None:
+        """Nothing to compile."""
+
+
 class Executor:
     """Replays the steps made of `launches`."""
 
-    def __init__(self, launches: list[Launch], device: str, workers: int = 1) -> None:
+    def __init__(self, launches: Sequence[Launch | Call], device: str, workers: int = 1) -> None:
         self.launches = [launch for launch in launches if launch.dim > 0]
         self.device = device
         self.workers = max(1, workers)
@@ -85,7 +106,7 @@ class Executor:
                     launch.run(self.device)
         return capture.graph
 
-    def _capture_phase(self, launch: Launch) -> list[Any]:
+    def _capture_phase(self, launch: Launch | Call) -> list[Any]:
         graphs: list[Any] = []
         for worker in range(self.workers):
             if launch.part(worker, self.workers)[1] == 0:

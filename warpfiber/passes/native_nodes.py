@@ -25,8 +25,8 @@ MOST_NODES = 512
 FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    groups pivots fiber_node_start fiber_group gradient deformation out_start in_start in_pair
-    pair_acts pair_force pair_closest pair_arm_i pair_arm_j list_pos node_pos node_velocity status
+    list_sizes groups pivots fiber_node_start fiber_group gradient deformation out_start in_start
+    in_pair pair_acts pair_force pair_closest pair_arm_i pair_arm_j list_pos node_pos node_velocity status
     pair_i pair_j block_fiber block_own
 """.split()
 
@@ -74,8 +74,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
         wall_high: vec3,
         strength: real,
         decay: real,
-        list_reach: real,
-        skin: real,
+        list_sizes: wp.array(dtype=real),
         stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
@@ -110,8 +109,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
         wall_high: vec3,
         strength: real,
         decay: real,
-        list_reach: real,
-        skin: real,
+        list_sizes: wp.array(dtype=real),
         stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
@@ -145,8 +143,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
             wall_high,
             strength,
             decay,
-            list_reach,
-            skin,
+            list_sizes,
             stretch_allowed,
             groups,
             pivots,

@@ -256,7 +256,7 @@ _STEP = """
                 norm += wp::abs(T(0.5) * (A[row][col] + A[col][row]) - (row == col ? T(1) : T(0)));
             stretch = norm > stretch ? norm : stretch;
         }
-        limit = T(0.5) * (skin - stretch * list_reach);
+        limit = T(0.5) * (list_sizes[1] - stretch * list_sizes[0]);
         load(p, (const T*)list_pos);
     }
     for (int k = segments; k >= 0; --k) {

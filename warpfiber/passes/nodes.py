@@ -144,8 +144,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
         wall_high: vec3,
         strength: real,
         decay: real,
-        list_reach: real,
-        skin: real,
+        list_sizes: wp.array(dtype=real),
         stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
@@ -291,7 +290,9 @@ def make_node_sweep(name: str, features: NodeFeatures):
         if wp.static(not is_paper):
             kick = dt / damped_mass(g.mass, half_drag)
         affine = mat33(deformation[0])
-        limit = skin_limit(affine, skin, list_reach)
+        limit = zero
+        if wp.static(has_pairs):
+            limit = skin_limit(affine, list_sizes[1], list_sizes[0])
         furthest = zero
         partial = vec3(zero, zero, zero)
         n_before = vec3(zero, zero, zero)

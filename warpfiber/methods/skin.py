@@ -1,0 +1,117 @@
+"""How thick the skin of a neighbor list should be: what builds cost against what it adds to sweeps.
+
+A step costs build(s) u / s + PAIR_COST pairs(s) at the skin s, if motion uses up u of it per step.
+Builds tell u and the number of pairs; how the number changes with s follows from the volume around
+a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
+(excluded volume of spherocylinders, Onsager 1949). Nothing here looks at a clock: two runs, and a
+run and its continuation, choose the same skins and so build at the same steps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+# ns, one core, float64, 20,000 segments; only ratios matter.
+BUILD_PIECE, BUILD_NEAR = 140.0, 100.0  # of a piece; of what it finds around it at the first skin
+PAIR_COST = 15.0  # of one more listed pair in a step
+START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
+RATIO = 1.1  # of neighboring choices
+WORTH = 0.97  # another skin must cost less than this part of the present one
+LARGEST_CHANGE = 1.5  # of one build
+MEMORY = 0.5  # weight of the use before in the mean
+# Measured: listed pairs grow with the volume from this part of the distance in contact on.
+CORE = 0.85
+
+
+@dataclass
+class SkinChoice:
+    """Skin of a list from build to build; lengths in run units."""
+
+    skin: float
+    start: float
+    largest: float  # that the box allows
+    least: float
+    radius: float  # the largest
+    reach: float
+    core: float  # distance of center lines in contact
+    length: float  # mean length of a segment
+    pieces_per_segment: float
+    fixed: bool = False
+    use: float = 0.0  # skin per step; 0 as long as nothing is known
+    built_step: int = 0
+    # for the report: the mean over steps and what made it
+    steps: int = 0
+    skin_steps: float = 0.0
+    changes: int = 0
+
+    def volume(self, distance: float) -> float:
+        """Where midpoints of segments nearer than `distance` lie, mean over orientations."""
+        h, length = distance, self.length
+        return math.pi * h * (4.0 / 3.0 * h * h + 2.0 * length * h + 0.5 * length * length)
+
+    def built(self, step: int) -> None:
+        """A list was built at this step."""
+        self._count(step)
+        self.built_step = step
+
+    def _count(self, step: int) -> None:
+        taken = max(0, step - self.built_step)
+        self.steps += taken
+        self.skin_steps += taken * self.skin
+
+    def choose(self, step: int, pairs_per_segment: float) -> float:
+        """The skin of the next build, after the present one was used up at `step`."""
+        used = self.skin / max(1, step - self.built_step)
+        self.use = used if self.use == 0.0 else MEMORY * self.use + (1.0 - MEMORY) * used
+        if self.fixed or pairs_per_segment <= 0.0:
+            return self.skin
+        low = max(self.least, self.skin / LARGEST_CHANGE)
+        high = min(self.largest, self.skin * LARGEST_CHANGE)
+        best, least = self.skin, WORTH * self.cost(self.skin, pairs_per_segment)
+        skin = self.least
+        while skin <= high:
+            if skin >= low and (cost := self.cost(skin, pairs_per_segment)) < least:
+                best, least = skin, cost
+            skin *= RATIO
+        return best
+
+    def cost(self, skin: float, pairs_per_segment: float) -> float:
+        """ns per segment-step, with `pairs_per_segment` at the present skin."""
+        core = self.volume(CORE * self.core)
+        now = self.volume(self.reach + self.skin) - core
+        pairs = pairs_per_segment * (self.volume(self.reach + skin) - core) / now
+        near = self._around(skin) / self._around(2.0 * START_SKIN * self.radius)
+        build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * near)
+        return build / max(1.0, skin / self.use) + PAIR_COST * pairs
+
+    def _around(self, skin: float) -> float:
+        """Volume around a segment in which midpoints are compared."""
+        wide = self.reach + skin + 0.5 * self.length
+        return wide * wide * (self.length + 4.0 / 3.0 * wide)
+
+    def set_skin(self, skin: float) -> None:
+        """Another skin."""
+        self.changes += skin != self.skin
+        self.skin = skin
+
+    def mean(self, step: int) -> float:
+        """Mean skin over the steps so far."""
+        steps = self.steps_counted(step)
+        now = steps - self.steps
+        return (self.skin_steps + now * self.skin) / steps if steps else self.skin
+
+    def steps_counted(self, step: int) -> int:
+        """Steps since this choice began, in this process."""
+        return self.steps + max(0, step - self.built_step)
+
+    def saved(self) -> np.ndarray:
+        """What a continued run needs to choose the same."""
+        return np.asarray([self.skin, self.use, float(self.built_step)])
+
+    def restore(self, saved: np.ndarray) -> None:
+        """Take over what `saved` returned."""
+        self.skin, self.use = float(saved[0]), float(saved[1])
+        self.built_step = int(saved[2])

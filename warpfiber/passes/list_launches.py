@@ -1,0 +1,296 @@
+"""The launches of one list build, with the arguments of every kernel."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warpfiber.model import PAIR_COUNT
+from warpfiber.passes.executor import Call, Launch
+
+if TYPE_CHECKING:
+    from warpfiber.passes.neighbors import NeighborList
+
+Launches = list[Launch | Call]
+
+
+def list_launches(pairs: NeighborList) -> Launches:
+    """Fibers into the box, pieces into cells, pairs out of them."""
+    if pairs.native:
+        return [*_bin(pairs), _native_sort(pairs), _gather(pairs), *_native_pairs(pairs)]
+    return [*_bin(pairs), *_plain_sort(pairs), _gather(pairs), *_plain_pairs(pairs)]
+
+
+def _launch(pairs: NeighborList, name: str, dim: int, *inputs: Any, split: bool = True) -> Launch:
+    return Launch(name, pairs.kernels[name], dim, list(inputs), split=split)
+
+
+def _bin(pairs: NeighborList) -> Launches:
+    model, state = pairs.model, pairs.state
+    return [
+        _launch(
+            pairs,
+            "place_fibers",
+            model.fiber_count,
+            pairs.wraps,
+            state.lattice,
+            state.gradient,
+            model.fiber_node_start,
+            state.node_pos,
+            state.node_velocity,
+            state.fiber_image,
+            state.list_pos,
+        ),
+        _launch(
+            pairs,
+            "start_list",
+            1,
+            pairs.sizes,
+            pairs.cell_capacity,
+            state.lattice,
+            state.list_lattice,
+            state.deformation,
+            pairs.inverse,
+            pairs.cells,
+            pairs.frame,
+            state.status,
+            split=False,
+        ),
+        _launch(
+            pairs,
+            "bin_pieces",
+            pairs.piece_count,
+            wp.vec3d(*model.domain.low),
+            pairs.inverse,
+            pairs.cells,
+            pairs.piece_segment,
+            pairs.piece_part,
+            model.segment_node,
+            state.node_pos,
+            pairs.piece_wrap,
+            pairs.cell_key,
+            pairs.order,
+        ),
+    ]
+
+
+def _gather(pairs: NeighborList) -> Launch:
+    return _launch(
+        pairs,
+        "gather_pieces",
+        pairs.piece_count,
+        pairs.stride,
+        wp.vec3d(*pairs.model.domain.low),
+        pairs.state.lattice,
+        pairs.order,
+        pairs.piece_wrap,
+        pairs.piece_segment,
+        pairs.piece_part,
+        pairs.model.segment_node,
+        pairs.state.node_pos,
+        pairs.planes,
+        pairs.sorted_start,
+        pairs.sorted_axis,
+        pairs.sorted_segment,
+        pairs.sorted_wrap,
+        pairs.sorted_part,
+    )
+
+
+# -- CPU: native search and sorts, one item per worker --------------------------------------------
+
+
+def _native_sort(pairs: NeighborList) -> Launch:
+    return _launch(
+        pairs,
+        "sort_cells",
+        pairs.workers,
+        pairs.workers,
+        pairs.cells,
+        pairs.piece_total,
+        pairs.cell_key,
+        pairs.cell_start,
+        pairs.order,
+    )
+
+
+def _native_pairs(pairs: NeighborList) -> Launches:
+    model, state, workers = pairs.model, pairs.state, pairs.workers
+    found = (pairs.row_i, pairs.row_j, pairs.row_image)
+    listed = (pairs.pair_i, pairs.pair_j, pairs.pair_image)
+    return [
+        _launch(
+            pairs,
+            "search_pairs",
+            workers,
+            workers,
+            pairs.piece_count,
+            pairs.stride,
+            pairs.region,
+            pairs.sizes,
+            pairs.cells,
+            pairs.frame,
+            pairs.cell_key,
+            pairs.order,
+            pairs.cell_start,
+            pairs.planes,
+            pairs.sorted_segment,
+            pairs.sorted_wrap,
+            model.segment_fiber,
+            pairs.fiber_skip,
+            *found,
+            pairs.found_count,
+            pairs.tally,
+        ),
+        _launch(
+            pairs,
+            "confirm_pairs",
+            workers * pairs.region,
+            pairs.region,
+            pairs.sizes,
+            state.lattice,
+            pairs.sorted_start,
+            pairs.sorted_axis,
+            pairs.sorted_segment,
+            pairs.sorted_part,
+            pairs.found_count,
+            *found,
+        ),
+        _launch(
+            pairs,
+            "order_rows",
+            workers,
+            workers,
+            model.segment_count,
+            pairs.region,
+            pairs.pair_capacity,
+            pairs.found_count,
+            *found,
+            state.status,
+            pairs.out_start,
+            pairs.pair_slot,
+            *listed,
+        ),
+        _launch(
+            pairs,
+            "index_partners",
+            workers,
+            workers,
+            model.segment_count,
+            state.status,
+            pairs.pair_j,
+            pairs.in_start,
+            pairs.in_pair,
+            state.status[PAIR_COUNT : PAIR_COUNT + 1],
+        ),
+    ]
+
+
+# -- everywhere: padded rows and radix sorts ------------------------------------------------------
+
+
+def _sort(keys: Any, values: Any, count: int, bins: int) -> Call:
+    bits = max(1, math.ceil(math.log2(bins + 1)))
+
+    def sort() -> None:
+        wp.utils.radix_sort_pairs(keys, values, count, 0, bits)
+
+    return Call("sort", sort)
+
+
+def _starts(pairs: NeighborList, keys: Any, total: Any, slot: int, bins: int, out: Any) -> Launch:
+    dim = len(keys) // 2 + 1
+    return _launch(pairs, "mark_starts", dim, total, slot, bins, keys, out, split=False)
+
+
+def _plain_sort(pairs: NeighborList) -> Launches:
+    bins = pairs.cell_capacity
+    return [
+        _sort(pairs.cell_key, pairs.order, pairs.piece_count, bins),
+        _starts(pairs, pairs.cell_key, pairs.piece_total, 0, bins, pairs.cell_start),
+    ]
+
+
+def _plain_pairs(pairs: NeighborList) -> Launches:
+    model, state = pairs.model, pairs.state
+    count, capacity, segments = pairs.piece_count, pairs.pair_capacity, model.segment_count
+    rows = (pairs.row_i, pairs.row_j, pairs.row_image)
+    status = state.status
+
+    def scan() -> None:
+        wp.utils.array_scan(pairs.row_count, pairs.row_end, inclusive=True)
+
+    return [
+        _launch(
+            pairs,
+            "find_pairs",
+            count,
+            pairs.row_capacity,
+            pairs.stride,
+            pairs.sizes,
+            pairs.cells,
+            pairs.frame,
+            state.lattice,
+            pairs.cell_key,
+            pairs.cell_start,
+            pairs.planes,
+            pairs.sorted_start,
+            pairs.sorted_axis,
+            pairs.sorted_segment,
+            pairs.sorted_wrap,
+            pairs.sorted_part,
+            model.segment_fiber,
+            pairs.fiber_skip,
+            pairs.row_count,
+            *rows,
+            status,
+            split=False,
+        ),
+        Call("scan", scan),
+        _launch(pairs, "check_capacity", 1, count, capacity, pairs.row_end, status, split=False),
+        _launch(
+            pairs,
+            "compact_rows",
+            count,
+            pairs.row_capacity,
+            pairs.row_count,
+            pairs.row_end,
+            status,
+            pairs.pair_slot,
+            split=False,
+        ),
+        _launch(
+            pairs,
+            "fetch_keys",
+            capacity,
+            segments,
+            pairs.row_i,
+            pairs.pair_slot,
+            status,
+            pairs.pair_key,
+            pairs.in_key,
+            pairs.in_pair,
+            split=False,
+        ),
+        _sort(pairs.pair_key, pairs.pair_slot, capacity, segments),
+        _starts(pairs, pairs.pair_key, status, PAIR_COUNT, segments, pairs.out_start),
+        _launch(
+            pairs,
+            "fetch_pairs",
+            segments,
+            pairs.out_start,
+            pairs.pair_slot,
+            pairs.row_j,
+            pairs.row_image,
+            status,
+            pairs.pair_i,
+            pairs.pair_j,
+            pairs.pair_image,
+            pairs.in_key,
+            split=False,
+        ),
+        _sort(pairs.in_key, pairs.in_pair, capacity, segments),
+        _starts(pairs, pairs.in_key, status, PAIR_COUNT, segments, pairs.in_start),
+    ]
