@@ -207,7 +207,7 @@ def test_translation_and_still_fluid() -> None:
     pull = np.tile([0.3, -0.2, 0.1], (6, 1)) * chain.matrix.sum(1)[:, None]
     straight = bc.straight_nodes(chain, (0, 1, 0), (1, 2, 3))
     v = od.velocity(still, od.Shape(straight, np.zeros(5)), pull)
-    assert np.abs(v - np.array([0.3, -0.2, 0.1]) / chain.drag).max() < 1e-15
+    assert np.abs(v - np.array([0.3, -0.2, 0.1]) / chain.drag).max() < 1e-13
     # A bent fiber relaxes; the mean over beads stays.
     shape = od.Shape(x, od.elastic_tension(chain, x))
     energy = od.bending_energy(chain, x)
