@@ -42,6 +42,7 @@ class Entries:
     """code of q"""
 
     def taken(self, index: NDArray[np.intp]) -> Entries:
+        """These rows, (n,)."""
         return Entries(self.row[index], self.key[index], self.image[index])
 
 
