@@ -44,6 +44,26 @@ class Capsules:
     def __len__(self) -> int:
         return len(self.half)
 
+    def taken(self, index: NDArray[np.integer[Any]]) -> Capsules:
+        """Copies of these rows, (n,)."""
+        return Capsules(
+            self.center[index],
+            self.direction[index],
+            self.half[index],
+            self.radius[index],
+            self.owner[index],
+        )
+
+    def joined(self, other: Capsules) -> Capsules:
+        """These rows, then the others; owners stay as they are."""
+        return Capsules(
+            np.concatenate([self.center, other.center]),
+            np.concatenate([self.direction, other.direction]),
+            np.concatenate([self.half, other.half]),
+            np.concatenate([self.radius, other.radius]),
+            np.concatenate([self.owner, other.owner]),
+        )
+
 
 @dataclass
 class Pairs:

@@ -45,6 +45,14 @@ class Entries:
         """These rows, (n,)."""
         return Entries(self.row[index], self.key[index], self.image[index])
 
+    def joined(self, other: Entries) -> Entries:
+        """These rows, then the others."""
+        return Entries(
+            np.concatenate([self.row, other.row]),
+            np.concatenate([self.key, other.key]),
+            np.concatenate([self.image, other.image]),
+        )
+
 
 @dataclass
 class CellGrid:
@@ -62,14 +70,15 @@ class CellGrid:
         """Cells within `grow` (m) of axes; center (n, 3) m, direction (n, 3), half, grow (n,) m."""
         room = np.maximum(float(self.edge.min()) - 2.0 * grow, grow)
         per = np.maximum(1, np.ceil(2.0 * half / np.maximum(room, 1e-300))).astype(np.int64)
-        parts = []
+        none = np.zeros(0, dtype=np.int64)
+        parts = [(none, none, none)]
         for rows in _split(per):
-            parts.append(self._entries(rows, center, direction, half, grow, per[rows]))
-        return Entries(*(np.concatenate([getattr(p, k) for p in parts]) for k in _FIELDS))
+            parts += self._entries(rows, center, direction, half, grow, per[rows])
+        return Entries(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def _entries(
         self, rows: slice, center: Floats, direction: Floats, half: Floats, grow: Floats, per: Ints
-    ) -> Entries:
+    ) -> list[tuple[Ints, Ints, Ints]]:
         row = np.repeat(np.arange(rows.start, rows.stop), per)
         rank = np.arange(len(row)) - np.repeat(np.cumsum(per) - per, per)
         part = np.repeat(half[rows] / per, per)
@@ -99,7 +108,7 @@ class CellGrid:
                     real &= cell <= highs[k]
             at = np.flatnonzero(new & real)
             made.append((row[at], *self._number([lows[k][at] + step[k] for k in range(3)])))
-        return Entries(*(np.concatenate(part) for part in zip(*made, strict=True)))
+        return made
 
     def _number(self, cell: list[Ints]) -> tuple[Ints, Ints]:
         """Cell number in the box and code of q; cell three arrays (n,)."""
@@ -109,9 +118,6 @@ class CellGrid:
             key = key * self.count[k] + (cell[k] - q * self.count[k])
             image = image * IMAGES + q
         return key, image
-
-
-_FIELDS = ("row", "key", "image")
 
 
 def make_grid(
