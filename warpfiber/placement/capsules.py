@@ -131,34 +131,57 @@ def near_pairs(
     made = made.taken(np.argsort(made.key, kind="stable"))
     after = np.arange(1, len(made.key) + 1)
     last = np.searchsorted(made.key, made.key, side="right")
-    images = int(np.abs(shift_of(made.image)).max(initial=0))
-    base = 4 * images + 1
+    packed = _Packed(n, shift_of(made.image))
     found: list[Ints] = []
     for k, m in matches(after, last - after):
-        i, j = made.row[k], made.row[m]
-        shift = made.image[k] - made.image[m]
-        shift = np.where(i > j, -shift, np.where(i == j, np.abs(shift), shift))
-        i, j = np.minimum(i, j), np.maximum(i, j)
-        keep = (capsules.owner[i] != capsules.owner[j]) | (shift != 0)
-        key = (i[keep] * n + j[keep]) * base**3 + _digits(shift_of(shift[keep]), base)
+        key = packed.key(made.row, k, m)
+        i, j, shift = packed.pair(key)
+        own = capsules.owner[i] == capsules.owner[j]
+        if np.any(own):
+            key = key[~own | (shift != 0)]
         key = _unique(key)
-        pairs = _unpacked(key, n, base)
-        found.append(key[pair_gap(capsules, pairs, size) < margin])
-    return _unpacked(_unique(np.concatenate(found or [after[:0]])), n, base)
+        found.append(key[pair_gap(capsules, packed.pairs(key), size) < margin])
+    return packed.pairs(_unique(np.concatenate(found or [after[:0]])))
 
 
-def _digits(shift: Ints, base: int) -> Ints:
-    """One number per shift (n, 3)."""
-    x, y, z = shift.T + base // 2
-    return np.asarray((x * base + y) * base + z)
+class _Packed:
+    """Pairs packed into one number each: i, j, and the three digits of the shift."""
 
+    def __init__(self, n: int, image: Ints) -> None:
+        """n: capsules; image: of every entry, (m, 3)."""
+        self.base = 4 * int(np.abs(image).max(initial=0)) + 1
+        self.row_bits = n.bit_length()
+        self.middle = self.base**3 // 2
+        self.code_bits = int(self.base**3).bit_length()
+        if 2 * self.row_bits + self.code_bits > 63:
+            raise ValueError("fibers reach through too many images of the box; enlarge box.size")
+        self.code = (image[:, 0] * self.base + image[:, 1]) * self.base + image[:, 2]
 
-def _unpacked(key: Ints, n: int, base: int) -> Pairs:
-    """Pairs of packed numbers."""
-    ij, code = np.divmod(key, base**3)
-    i, j = np.divmod(ij, n)
-    shift = np.stack([code // base**2, code // base % base, code % base], axis=1)
-    return Pairs(i, j, shift - base // 2)
+    def key(self, row: Ints, k: Ints, m: Ints) -> Ints:
+        """Of entries k and m; i is the smaller row, and of own images the upper one counts."""
+        i, j = row[k], row[m]
+        shift = self.code[k] - self.code[m]
+        turned = (i > j) | ((i == j) & (shift < 0))
+        shift[turned] *= -1
+        upper = np.minimum(i, j) << (self.row_bits + self.code_bits)
+        return np.asarray(upper | (np.maximum(i, j) << self.code_bits) | (shift + self.middle))
+
+    def pair(self, key: Ints) -> tuple[Ints, Ints, Ints]:
+        """i, j and the packed shift."""
+        j = (key >> self.code_bits) & ((1 << self.row_bits) - 1)
+        shift = (key & ((1 << self.code_bits) - 1)) - self.middle
+        return key >> (self.row_bits + self.code_bits), j, shift
+
+    def pairs(self, key: Ints) -> Pairs:
+        """The same with the shift of every axis."""
+        i, j, code = self.pair(key)
+        shift = np.zeros((len(key), 3), dtype=np.int64)
+        far = np.flatnonzero(code)
+        rest = code[far] + self.middle
+        for k in (2, 1, 0):
+            shift[far, k] = rest % self.base - self.base // 2
+            rest //= self.base
+        return Pairs(i, j, shift)
 
 
 def _unique(key: Ints) -> Ints:
@@ -172,7 +195,8 @@ def pair_gap(capsules: Capsules, pairs: Pairs, size: Floats | None) -> Floats:
     i, j = pairs.i, pairs.j
     offset = capsules.center[i] - capsules.center[j]
     if size is not None:
-        offset = offset - pairs.shift * np.where(np.isfinite(size), size, 0.0)
+        far = np.flatnonzero(np.any(pairs.shift, axis=1))
+        offset[far] -= pairs.shift[far] * np.where(np.isfinite(size), size, 0.0)
     _, _, gap = axis_distance(
         offset, capsules.direction[i], capsules.half[i], capsules.direction[j], capsules.half[j]
     )

@@ -26,7 +26,7 @@ IMAGES = 1 << 20
 """Base of image codes; a code packs three signed image numbers."""
 MOST_CELLS = 1e6
 """Cells per axis where nothing bounds the fibers; three of these fit one 64-bit cell number."""
-CHUNK = 1 << 19
+CHUNK = 1 << 17
 """Pieces or pairs handled at once, which bounds the memory."""
 
 

@@ -22,12 +22,14 @@ FIRST_TRIES = 4
 """Centers per fiber in the first draw; each next draw takes twice as many."""
 DRAWN = 1 << 18
 """Most centers drawn at once."""
-PART = 64
+PART = 32
 """Groups that all fibers go in by: fibers of one group are seldom in each other's way."""
 STALLED = 0.5
 """Part of a group set aside from which on insertion counts as stalled."""
-BEST_OF = 64
-"""Random centers of which a fiber without free center takes the one that overlaps least."""
+DRAWS = 128
+"""Random centers of a fiber without free center, of which the least blocked are looked at."""
+BEST_OF = 8
+"""Centers looked at, of which the fiber takes the one that overlaps least."""
 
 
 class Crowd:
@@ -148,10 +150,15 @@ class Crowd:
 
     def squeeze(self, which: Ints, rng: np.random.Generator) -> None:
         """Places these fibers where they overlap least, of some random centers."""
-        part = max(1, -(-len(self.loose) // (2 * PART)))
-        for start in range(0, len(which), part):
-            group = which[start : start + part]
-            row, center = self._drawn(group, BEST_OF, rng)
+        step = max(1, -(-len(self.loose) // (4 * PART)))
+        for start in range(0, len(which), step):
+            group = which[start : start + step]
+            row, center = self._drawn(group, DRAWS, rng)
+            loose = self.loose
+            part = self.voxels.blocked_parts(center, loose.direction[row], loose.half[row])
+            least = np.argsort(part.reshape(-1, DRAWS), axis=1, kind="stable")[:, :BEST_OF]
+            least = (least + DRAWS * np.arange(len(group))[:, None]).ravel()
+            row, center = row[least], center[least]
             hit, missing = self.overlaps(self._at(row, center))
             cost = np.bincount(hit, missing**2, minlength=len(row)).reshape(-1, BEST_OF)
             best = np.argmin(cost, axis=1) + BEST_OF * np.arange(len(group))

@@ -212,7 +212,7 @@ class _Packing:
             else:
                 placed[more] = True
                 self.squeezed += len(more)
-            if len(more) and self.apart:
+            if self.apart and not np.all(placed):
                 self._fill(crowd, placed)
         for k, g in enumerate(random):
             mine = group == k
@@ -220,10 +220,7 @@ class _Packing:
             g.tries += int(tries[mine].sum())
 
     def _fill(self, crowd: Crowd, placed: NDArray[np.bool_]) -> None:
-        """Lists what is placed, with centers in the box, from the beginning."""
-        size, periodic, center = self.cell.size, self.cell.periodic, crowd.loose.center
-        if size is not None:
-            center -= np.where(periodic, np.floor(center / size) * size, 0.0)
+        """Lists what is placed from the beginning."""
         crowd.clear()
         for capsules in [*self.held, crowd.loose.taken(np.flatnonzero(placed))]:
             crowd.add(capsules)
@@ -240,7 +237,10 @@ class _Packing:
         self.sweeps += sweeps
         self.relaxations += 1
         if clear:
-            loose.center[which] = capsules.center[:n]
+            center, size = capsules.center[:n], self.cell.size
+            if size is not None:
+                center -= np.where(self.cell.periodic, np.floor(center / size) * size, 0.0)
+            loose.center[which] = center
             loose.direction[which] = capsules.direction[:n]
         return clear
 

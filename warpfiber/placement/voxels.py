@@ -44,6 +44,7 @@ class Voxels:
         # The last term is for rounding in single precision.
         self.diagonal = 0.5 * float(np.linalg.norm(self.edge)) + 1e-3 * edge
         self.stride = np.array([self.count[1] * self.count[2], self.count[2], 1])
+        self.useful = touching > self.diagonal
         self.blocked = np.zeros(int(np.prod(self.count)), dtype=bool)
 
     def add(self, center: Floats, direction: Floats, half: Floats, spare: Floats) -> None:
@@ -91,28 +92,61 @@ class Voxels:
     def passed(self, center: Floats, direction: Floats, half: Floats) -> Ints:
         """Rows of fibers (n, 3), (n, 3), (n,) of which no tested point is blocked."""
         alive = np.arange(len(half))
-        if not len(half) or self.touching <= self.diagonal:
+        if not len(half) or not self.useful:
             return alive
-        tested, points = 0, int(np.ceil(4.0 * float(half.max()) / self.touching)) + 1
-        places = 2.0 * _spread(points) - 1.0
-        while tested < points and len(alive):
+        middle, reach = self._scaled(center, direction, half)
+        places = self._places(half, 2.0)
+        tested = 0
+        while tested < len(places) and len(alive):
             some = places[tested : max(tested + 1, 2 * tested)]
             tested += len(some)
-            free = np.ones(len(alive), dtype=bool)
-            for t in some:
-                free &= ~self.blocked[self._index(center, direction, t * half, alive)]
-            alive = alive[free]
+            free = ~np.any(self.blocked[self._index(middle, reach, some)], axis=0)
+            alive, middle, reach = alive[free], middle[:, free], reach[:, free]
         return alive
 
-    def _index(self, center: Floats, direction: Floats, along: Floats, row: Ints) -> Ints:
-        """Voxel number of the points center + along * direction of these rows."""
-        index = np.zeros(len(row), dtype=np.int64)
+    def blocked_parts(self, center: Floats, direction: Floats, half: Floats) -> Floats:
+        """Part of the length of fibers (n, 3), (n, 3), (n,) that is surely blocked, (n,)."""
+        part = np.zeros(len(half))
+        if not len(half) or not self.useful:
+            return part
+        places = self._places(half, 1.0)
+        step = max(1, CHUNK // len(places))
+        for first in range(0, len(half), step):
+            rows = slice(first, first + step)
+            middle, reach = self._scaled(center[rows], direction[rows], half[rows])
+            part[rows] = np.mean(self.blocked[self._index(middle, reach, places)], axis=0)
+        return part
+
+    def _places(self, half: Floats, density: float) -> NDArray[np.float32]:
+        """t of the tested points, so many per touching distance of the longest fiber."""
+        count = int(np.ceil(2.0 * density * float(half.max()) / self.touching)) + 1
+        return (2.0 * _spread(count) - 1.0).astype(np.float32)
+
+    def _scaled(
+        self, center: Floats, direction: Floats, half: Floats
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Centers and half fibers in extents of the grid, (3, n)."""
+        middle = (center - self.low) / self.extent
+        reach = direction * half[:, None] / self.extent
+        return middle.T.astype(np.float32), reach.T.astype(np.float32)
+
+    def _index(
+        self,
+        middle: NDArray[np.float32],
+        reach: NDArray[np.float32],
+        places: NDArray[np.float32],
+    ) -> Ints:
+        """Voxel number of points (places, n) of fibers (3, n)."""
+        index = np.zeros((len(places), middle.shape[1]), dtype=np.int64)
         for k in range(3):
-            u = center[row, k] + along[row] * direction[row, k]
-            u = (u - self.low[k]) / self.extent[k]
-            u -= np.floor(u) if self.periodic[k] else 0.0
-            cell = (u * self.count[k]).astype(np.int64)
-            index += np.clip(cell, 0, self.count[k] - 1) * self.stride[k]
+            u = np.multiply.outer(places, reach[k])
+            u += middle[k]
+            if self.periodic[k]:
+                u -= np.floor(u)
+            u *= np.float32(self.count[k])
+            cell = u.astype(np.int32)
+            np.minimum(cell, np.int32(self.count[k] - 1), out=cell)
+            index += cell * self.stride[k]
         return index
 
 
