@@ -21,6 +21,8 @@ AIM = 3.0 * CLEARANCE
 """Relative distance aimed at; above the bar, so that the bar is met after finitely many sweeps."""
 WIDE = 2.0
 """Skin of the list of near pairs, in diameters; twice the skin, half as many searches."""
+LAST = 12
+"""Sweeps that a list of the closest pairs is to last: shorter lists against fewer of them."""
 CHECK_EVERY = 250
 """Sweeps between two looks at the progress."""
 
@@ -105,7 +107,7 @@ class _Lists:
         self.capsules, self.cell = capsules, cell
         widest = 2.0 * float(capsules.radius.max())
         self.wide = WIDE * widest
-        self.thin = 0.25 * self.wide
+        self.thin = 0.2 * self.wide
         self.spare = 2.0 * AIM * widest
         self.made = 0
         self.near: Rows | None = None
@@ -114,24 +116,29 @@ class _Lists:
 
     def touching(self, sweep: int) -> Rows:
         """All pairs that push each other now."""
-        limit = 0.5 * (self.thin - self.spare)
-        if self.close is None or _moved(self.capsules, self.anchor) > limit:
+        if self.close is None:
             self._renew(sweep)
+        else:
+            moved, lasted = _moved(self.capsules, self.anchor), sweep - self.made
+            if moved > 0.5 * (self.thin - self.spare) or lasted >= 2 * LAST:
+                thin = 2.0 * moved * LAST / lasted + self.spare
+                self.thin = min(max(thin, 2.0 * self.spare), 0.5 * self.wide)
+                self._renew(sweep)
         assert self.close is not None
         return self.close
 
     def _renew(self, sweep: int) -> None:
-        # A list that lasts a few sweeps costs less than what it leaves out.
-        if self.close is not None:
-            lasted = sweep - self.made
-            self.thin *= 1.5 if lasted < 6 else 0.67 if lasted > 20 else 1.0
-            self.thin = min(max(self.thin, 4.0 * self.spare), self.wide)
         self.made = sweep
         capsules = self.capsules
         self.anchor = capsules.center.copy(), capsules.direction.copy()
-        limit = 0.5 * (self.wide - self.spare)
         near = self.near
-        if near is None or _moved(capsules, self.near_anchor) + 0.5 * self.thin > limit:
+        left = 0.0
+        if near is not None:
+            left = self.wide - self.spare - 2.0 * _moved(capsules, self.near_anchor)
+        # A search costs many sweeps: near pairs serve until they hardly leave a skin.
+        if near is not None and left > 0.4 * self.thin:
+            self.thin = min(self.thin, left)
+        else:
             pairs = near_pairs(capsules, self.wide, self.cell.size, self.cell.periodic)
             near = self.near = _rows(pairs, capsules, self.cell)
             self.near_anchor = self.anchor
