@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warpfiber.placement.capsules import Capsules, Floats, Ints
-from warpfiber.placement.insertion import Cell, own_image_hit, wall_distance
 from warpfiber.placement.node_file import read_node_file
 from warpfiber.placement.orientations import (
     FLAT,
@@ -21,6 +20,7 @@ from warpfiber.placement.orientations import (
     orientation_tensor,
     tensor_from_values,
 )
+from warpfiber.placement.space import Cell, own_image_hit, wall_distance
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError
 
 ROUNDS = 1000

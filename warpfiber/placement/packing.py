@@ -1,9 +1,9 @@
 """Places all fibers of a scene: straight ones from statistics, others from a file, without overlap.
 
 Order: node files, then given centers, then random centers, longest fibers first. Random fibers are
-inserted one by one, each with its own direction. When no free center is found for one, a batch of
-fibers goes in where they overlap least, all fibers are relaxed by small translations and rotations,
-and insertion goes on.
+inserted at free centers, each with its own direction. When most find none, a batch of fibers goes
+in where they overlap least, all fibers are relaxed by small translations and rotations, and
+insertion goes on.
 
 Symbols: A orientation tensor, h half centerline length (m), a radius (m).
 Limits: a direction that does not fit between the walls, or that makes a fiber hit its own image, is
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from warpfiber.placement.capsules import Capsules, Floats, Ints, chain_capsules, near_pairs
 from warpfiber.placement.capsules import pair_gap as gaps_of
-from warpfiber.placement.crowd import Crowd
 from warpfiber.placement.groups import GroupFibers, group_fibers
-from warpfiber.placement.insertion import Cell, Inserted, Trial
+from warpfiber.placement.insertion import Crowd
 from warpfiber.placement.orientations import orientation_tensor, values_from_tensor
 from warpfiber.placement.relaxation import Freedom, relax
 from warpfiber.placement.shapes import straight_nodes
+from warpfiber.placement.space import Cell, Inserted
 from warpfiber.scene import Fault, Scene, SceneError
 
 BATCH = 0.2
@@ -163,8 +163,7 @@ class _Packing:
             for f in range(len(g.direction)):
                 draws = 0
                 while self.apart:
-                    trial = Trial(self.placed, g.direction[f], g.half, g.radius)
-                    if not len(trial.overlaps(g.given[f][None, :])[0]):
+                    if not self.placed.hit(g.given[f], g.direction[f], g.half, g.radius):
                         break
                     draws += 1
                     fresh = None if draws > DIRECTION_DRAWS else g.redraw(f, self.rng)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpfiber.placement.capsules import Capsules, Floats, Ints, Pairs, axis_distance, near_pairs
-from warpfiber.placement.insertion import CLEARANCE, Cell, contact_distance, wall_distance
+from warpfiber.placement.space import CLEARANCE, Cell, contact_distance, wall_distance
 
 AIM = 3.0 * CLEARANCE
 """Relative distance aimed at; above the bar, so that the bar is met after finitely many sweeps."""
@@ -117,24 +117,20 @@ class _Lists:
     def touching(self, sweep: int) -> Rows:
         """All pairs that push each other now."""
         if self.close is None:
-            self._renew(sweep)
-        else:
-            moved, lasted = _moved(self.capsules, self.anchor), sweep - self.made
-            if moved > 0.5 * (self.thin - self.spare) or lasted >= 2 * LAST:
-                thin = 2.0 * moved * LAST / lasted + self.spare
-                self.thin = min(max(thin, 2.0 * self.spare), 0.5 * self.wide)
-                self._renew(sweep)
-        assert self.close is not None
-        return self.close
+            return self._renewed(sweep)
+        moved, lasted = _moved(self.capsules, self.anchor), sweep - self.made
+        if moved <= 0.5 * (self.thin - self.spare) and lasted < 2 * LAST:
+            return self.close
+        thin = 2.0 * moved * LAST / lasted + self.spare
+        self.thin = min(max(thin, 2.0 * self.spare), 0.5 * self.wide)
+        return self._renewed(sweep)
 
-    def _renew(self, sweep: int) -> None:
+    def _renewed(self, sweep: int) -> Rows:
         self.made = sweep
         capsules = self.capsules
         self.anchor = capsules.center.copy(), capsules.direction.copy()
         near = self.near
-        left = 0.0
-        if near is not None:
-            left = self.wide - self.spare - 2.0 * _moved(capsules, self.near_anchor)
+        left = self.wide - self.spare - 2.0 * _moved(capsules, self.near_anchor)
         # A search costs many sweeps: near pairs serve until they hardly leave a skin.
         if near is not None and left > 0.4 * self.thin:
             self.thin = min(self.thin, left)
@@ -146,6 +142,7 @@ class _Lists:
         distance = np.sqrt(np.einsum("nk,nk->n", gap, gap))
         keep = np.flatnonzero(distance < near.reach + self.thin)
         self.close = Rows(near.i[keep], near.j[keep], near.offset[keep], near.reach[keep])
+        return self.close
 
 
 def _moved(capsules: Capsules, anchor: tuple[Floats, Floats]) -> float:
