@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from warpfiber.placement.insertion import Cell
 from warpfiber.placement.packing import Placement, overlap_of, place_fibers, scene_cell
+from warpfiber.placement.space import Cell
 
 __all__ = ["Placement", "place_fibers", "Cell", "scene_cell", "overlap_of"]

@@ -7,8 +7,7 @@ Source: the closest points are found by projecting and clamping twice, as in Eri
     Collision Detection (2005), section 5.1.9, here without branches.
 Symbols: s, t (m) closest points along the two directions, from the centers; D (m) distance of the
     axes; the image of capsule j with integer shift n has its center at center_j + n * size.
-Limits: orthogonal boxes; capsules are cut into pieces for a cell grid, so memory grows with
-    length / radius.
+Limits: orthogonal boxes.
 """
 
 from __future__ import annotations
@@ -19,8 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from warpfiber.placement.cells import Floats as Floats
+from warpfiber.placement.cells import Ints as Ints
+from warpfiber.placement.cells import make_grid, matches, shift_of
+
+CELL = 2.0
+"""Edge of a cell over the reach; measured best for random fibers of aspect ratio 20 to 100."""
 
 
 @dataclass
@@ -40,6 +43,26 @@ class Capsules:
 
     def __len__(self) -> int:
         return len(self.half)
+
+    def taken(self, index: NDArray[np.integer[Any]]) -> Capsules:
+        """Copies of these rows, (n,)."""
+        return Capsules(
+            self.center[index],
+            self.direction[index],
+            self.half[index],
+            self.radius[index],
+            self.owner[index],
+        )
+
+    def joined(self, other: Capsules) -> Capsules:
+        """These rows, then the others; owners stay as they are."""
+        return Capsules(
+            np.concatenate([self.center, other.center]),
+            np.concatenate([self.direction, other.direction]),
+            np.concatenate([self.half, other.half]),
+            np.concatenate([self.radius, other.radius]),
+            np.concatenate([self.owner, other.owner]),
+        )
 
 
 @dataclass
@@ -99,100 +122,72 @@ def near_pairs(
 
     Two capsules of one owner count only if one of them is an image.
     """
-    reach = 2.0 * float(capsules.radius.max()) + margin
-    piece = max(4.0 * reach, float(capsules.half.max()) / 32.0)
-    per = np.maximum(1, np.ceil(2.0 * capsules.half / piece)).astype(np.int64)
-    whose = np.repeat(np.arange(len(capsules)), per)
-    rank = np.arange(len(whose)) - np.repeat(np.cumsum(per) - per, per)
-    along = ((2 * rank + 1) / per[whose] - 1.0) * capsules.half[whose]
-    pos = capsules.center[whose] + along[:, None] * capsules.direction[whose]
-    part = capsules.half[whose] / per[whose]
-    cell = reach + 2.0 * float(part.max())
-
-    shift = np.zeros((len(pos), 3), dtype=np.int64)
-    if size is not None:
-        edge = np.where(periodic, size, 1.0)
-        shift[:, periodic] = -np.floor(pos / edge).astype(np.int64)[:, periodic]
-        pos = pos + shift * edge
-    ghost_of, ghost_pos, ghost_shift = _ghosts(pos, shift, cell, size, periodic)
-
-    # Fibers very far apart in an unbounded cell: larger cells keep the cell number an integer.
-    cell = max(cell, float((ghost_pos.max(axis=0) - ghost_pos.min(axis=0)).max()) / 1e6)
-    low = ghost_pos.min(axis=0) - cell
-    dims = np.floor((ghost_pos.max(axis=0) - low) / cell).astype(np.int64) + 2
-    key = _cell_key(np.floor((ghost_pos - low) / cell).astype(np.int64), dims)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    home = np.floor((pos - low) / cell).astype(np.int64)
-    found_i: list[Ints] = []
-    found_g: list[Ints] = []
-    for dx in (-1, 0, 1):
-        for dy in (-1, 0, 1):
-            # Cells along z follow each other in the key: one range of the list is three cells.
-            middle = _cell_key(home + np.array([dx, dy, 0]), dims)
-            lo = np.searchsorted(key, middle - 1, side="left")
-            hi = np.searchsorted(key, middle + 1, side="right")
-            n = hi - lo
-            i = np.repeat(np.arange(len(pos)), n)
-            g = order[np.arange(len(i)) + np.repeat(lo - (np.cumsum(n) - n), n)]
-            u, v = whose[i], whose[ghost_of[g]]
-            keep = (u <= v) & (
-                np.einsum("nk,nk->n", pos[i] - ghost_pos[g], pos[i] - ghost_pos[g])
-                < (reach + part[i] + part[ghost_of[g]]) ** 2
-            )
-            found_i.append(i[keep])
-            found_g.append(g[keep])
-    pi = np.concatenate(found_i)
-    pg = np.concatenate(found_g)
-    return _unique_pairs(
-        capsules, margin, size, whose[pi], whose[ghost_of[pg]], ghost_shift[pg] - shift[pi]
-    )
+    n = len(capsules)
+    grow = capsules.radius + 0.5 * margin
+    edge = CELL * max(2.0 * float(grow.max()), 4.0 * float(capsules.radius.max()))
+    extent = float((capsules.half + grow).max())
+    grid = make_grid(capsules.center, extent, edge, size, periodic)
+    made = grid.entries(capsules.center, capsules.direction, capsules.half, grow)
+    made = made.taken(np.argsort(made.key, kind="stable"))
+    after = np.arange(1, len(made.key) + 1)
+    last = np.searchsorted(made.key, made.key, side="right")
+    packed = _Packed(n, shift_of(made.image))
+    found: list[Ints] = []
+    for k, m in matches(after, last - after):
+        key = packed.key(made.row, k, m)
+        i, j, shift = packed.pair(key)
+        own = capsules.owner[i] == capsules.owner[j]
+        if np.any(own):
+            key = key[~own | (shift != 0)]
+        key = _unique(key)
+        found.append(key[pair_gap(capsules, packed.pairs(key), size) < margin])
+    return packed.pairs(_unique(np.concatenate(found or [after[:0]])))
 
 
-def _cell_key(index: Ints, dims: Ints) -> Ints:
-    """Cell number with z running fastest; index (n, 3)."""
-    return np.asarray((index[:, 0] * dims[1] + index[:, 1]) * dims[2] + index[:, 2])
+class _Packed:
+    """Pairs packed into one number each: i, j, and the three digits of the shift."""
+
+    def __init__(self, n: int, image: Ints) -> None:
+        """n: capsules; image: of every entry, (m, 3)."""
+        self.base = 4 * int(np.abs(image).max(initial=0)) + 1
+        self.row_bits = n.bit_length()
+        self.middle = self.base**3 // 2
+        self.code_bits = int(self.base**3).bit_length()
+        if 2 * self.row_bits + self.code_bits > 63:
+            raise ValueError("fibers reach through too many images of the box; enlarge box.size")
+        self.code = (image[:, 0] * self.base + image[:, 1]) * self.base + image[:, 2]
+
+    def key(self, row: Ints, k: Ints, m: Ints) -> Ints:
+        """Of entries k and m; i is the smaller row, and of own images the upper one counts."""
+        i, j = row[k], row[m]
+        shift = self.code[k] - self.code[m]
+        turned = (i > j) | ((i == j) & (shift < 0))
+        shift[turned] *= -1
+        upper = np.minimum(i, j) << (self.row_bits + self.code_bits)
+        return np.asarray(upper | (np.maximum(i, j) << self.code_bits) | (shift + self.middle))
+
+    def pair(self, key: Ints) -> tuple[Ints, Ints, Ints]:
+        """i, j and the packed shift."""
+        j = (key >> self.code_bits) & ((1 << self.row_bits) - 1)
+        shift = (key & ((1 << self.code_bits) - 1)) - self.middle
+        return key >> (self.row_bits + self.code_bits), j, shift
+
+    def pairs(self, key: Ints) -> Pairs:
+        """The same with the shift of every axis."""
+        i, j, code = self.pair(key)
+        shift = np.zeros((len(key), 3), dtype=np.int64)
+        far = np.flatnonzero(code)
+        rest = code[far] + self.middle
+        for k in (2, 1, 0):
+            shift[far, k] = rest % self.base - self.base // 2
+            rest //= self.base
+        return Pairs(i, j, shift)
 
 
-def _ghosts(
-    pos: Floats, shift: Ints, reach: float, size: Floats | None, periodic: NDArray[np.bool_]
-) -> tuple[Ints, Floats, Ints]:
-    """Points with their images within `reach` (m) of the box: point, position, total shift."""
-    source = np.arange(len(pos))
-    if size is None:
-        return source, pos, shift
-    counts = image_counts(np.full(3, reach), size, periodic)
-    for k in range(3):
-        if not periodic[k]:
-            continue
-        parts = []
-        for n in counts[k]:
-            z = pos[:, k] + n * size[k]
-            keep = (z > -reach) & (z < size[k] + reach) if n else np.ones(len(pos), dtype=bool)
-            moved, moved_shift = pos[keep].copy(), shift[keep].copy()
-            moved[:, k] += n * size[k]
-            moved_shift[:, k] += n
-            parts.append((source[keep], moved, moved_shift))
-        source, pos, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return source, pos, shift
-
-
-def _unique_pairs(
-    capsules: Capsules, margin: float, size: Floats | None, i: Ints, j: Ints, shift: Ints
-) -> Pairs:
-    """Drops repeated pairs, mirrored own images, bonded segments and pairs that are not near."""
-    own = i == j
-    x, y, z = shift.T
-    keep = ~own | (x > 0) | ((x == 0) & ((y > 0) | ((y == 0) & (z > 0))))
-    keep &= (capsules.owner[i] != capsules.owner[j]) | np.any(shift != 0, axis=1)
-    rows = np.column_stack([i, j, shift])[keep]
-    if len(rows):
-        rows = rows[np.lexsort(rows.T[::-1])]
-        rows = rows[np.append(True, np.any(rows[1:] != rows[:-1], axis=1))]
-    pairs = Pairs(rows[:, 0], rows[:, 1], rows[:, 2:])
-    gap = pair_gap(capsules, pairs, size)
-    near = gap < margin
-    return Pairs(pairs.i[near], pairs.j[near], pairs.shift[near])
+def _unique(key: Ints) -> Ints:
+    """Sorted, each once."""
+    key = np.sort(key)
+    return key[np.append(True, key[1:] != key[:-1])] if len(key) else key
 
 
 def pair_gap(capsules: Capsules, pairs: Pairs, size: Floats | None) -> Floats:
@@ -200,7 +195,8 @@ def pair_gap(capsules: Capsules, pairs: Pairs, size: Floats | None) -> Floats:
     i, j = pairs.i, pairs.j
     offset = capsules.center[i] - capsules.center[j]
     if size is not None:
-        offset = offset - pairs.shift * np.where(np.isfinite(size), size, 0.0)
+        far = np.flatnonzero(np.any(pairs.shift, axis=1))
+        offset[far] -= pairs.shift[far] * np.where(np.isfinite(size), size, 0.0)
     _, _, gap = axis_distance(
         offset, capsules.direction[i], capsules.half[i], capsules.direction[j], capsules.half[j]
     )

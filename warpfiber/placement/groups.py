@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warpfiber.placement.capsules import Floats, Ints
-from warpfiber.placement.insertion import Cell, own_image_hit, wall_distance
+from warpfiber.placement.capsules import Capsules, Floats, Ints
 from warpfiber.placement.node_file import read_node_file
 from warpfiber.placement.orientations import (
     FLAT,
@@ -21,6 +20,7 @@ from warpfiber.placement.orientations import (
     orientation_tensor,
     tensor_from_values,
 )
+from warpfiber.placement.space import Cell, own_image_hit, wall_distance
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError
 
 ROUNDS = 1000
@@ -58,6 +58,12 @@ class GroupFibers:
     """whether fibers must not overlap"""
     redrawn: int = 0
     tries: int = 0
+
+    def capsules(self) -> Capsules:
+        """One capsule per straight fiber."""
+        n = len(self.direction)
+        half, radius = np.full(n, self.half), np.full(n, self.radius)
+        return Capsules(self.center, self.direction, half, radius, np.arange(n))
 
     def misfits(self, direction: Floats, center: Floats | None) -> Ints:
         """Rows of directions (n, 3) that fit at no center, or not at the given ones (n, 3) m."""

@@ -1,9 +1,9 @@
 """Places all fibers of a scene: straight ones from statistics, others from a file, without overlap.
 
 Order: node files, then given centers, then random centers, longest fibers first. Random fibers are
-inserted one by one, each with its own direction. When no free center is found for one, a batch of
-fibers goes in where they overlap least, all fibers are relaxed by small translations and rotations,
-and insertion goes on.
+inserted at free centers, each with its own direction. When most find none, a batch of fibers goes
+in where they overlap least, all fibers are relaxed by small translations and rotations, and
+insertion goes on.
 
 Symbols: A orientation tensor, h half centerline length (m), a radius (m).
 Limits: a direction that does not fit between the walls, or that makes a fiber hit its own image, is
@@ -24,16 +24,13 @@ from numpy.typing import NDArray
 from warpfiber.placement.capsules import Capsules, Floats, Ints, chain_capsules, near_pairs
 from warpfiber.placement.capsules import pair_gap as gaps_of
 from warpfiber.placement.groups import GroupFibers, group_fibers
-from warpfiber.placement.insertion import Cell, Inserted, Trial
+from warpfiber.placement.insertion import Crowd
 from warpfiber.placement.orientations import orientation_tensor, values_from_tensor
 from warpfiber.placement.relaxation import Freedom, relax
 from warpfiber.placement.shapes import straight_nodes
+from warpfiber.placement.space import Cell, Inserted
 from warpfiber.scene import Fault, Scene, SceneError
 
-LINES = 256
-"""Random lines searched for a free center before insertion counts as stalled."""
-BEST_OF = 64
-"""Random centers of which a fiber without free center takes the one that overlaps least."""
 BATCH = 0.2
 """Part of all random fibers that goes in overlapping between two relaxations."""
 LAST_BATCH = 0.02
@@ -166,8 +163,7 @@ class _Packing:
             for f in range(len(g.direction)):
                 draws = 0
                 while self.apart:
-                    trial = Trial(self.placed, g.direction[f], g.half, g.radius)
-                    if not len(trial.overlaps(g.given[f][None, :])[0]):
+                    if not self.placed.hit(g.given[f], g.direction[f], g.half, g.radius):
                         break
                     draws += 1
                     fresh = None if draws > DIRECTION_DRAWS else g.redraw(f, self.rng)
@@ -182,106 +178,83 @@ class _Packing:
                     g.direction[f] = fresh
                 self.placed.add(g.given[f], g.direction[f], g.half, g.radius)
             g.center = g.given.copy()
-            n = len(g.direction)
-            self.held.append(
-                Capsules(
-                    g.center,
-                    g.direction,
-                    np.full(n, g.half),
-                    np.full(n, g.radius),
-                    np.arange(n),
-                )
-            )
+            self.held.append(g.capsules())
 
     def insert_random(self) -> None:
         """Fibers with random centers, longest first; from the first stall on in batches."""
-        random = [g for g in self.groups if g.given is None and not g.nodes]
-        queue = [(g, f) for g in random for f in range(len(g.direction))]
-        queue.sort(key=lambda item: -item[0].half)
-        batch = max(FEWEST, int(BATCH * len(queue)))
-        fewest = max(FEWEST, int(LAST_BATCH * len(queue)))
-        done, jammed = 0, False
-        while done < len(queue):
+        random = [g for g in self.groups if g.given is None and not g.nodes and len(g.direction)]
+        random.sort(key=lambda g: -g.half)
+        if not random:
+            return
+        loose = _joined([g.capsules() for g in random])
+        group = np.repeat(np.arange(len(random)), [len(g.direction) for g in random])
+        n = len(loose)
+        freedom = Freedom(np.ones(n), np.array([g.turning for g in random])[group])
+        crowd = Crowd(self.cell, loose)
+        placed = np.zeros(n, dtype=bool)
+        tries = np.zeros(n, dtype=np.int64)
+        batch, fewest = max(FEWEST, int(BATCH * n)), max(FEWEST, int(LAST_BATCH * n))
+        jammed = False
+        self._fill(crowd, placed)
+        while not np.all(placed):
             if not jammed:
-                done += self._insert_free(queue[done:])
-            more = min(batch, len(queue) - done)
-            for g, f in queue[done : done + more]:
-                low, high = self.cell.center_range(g.direction[f], g.half, g.radius)
-                trial = Trial(self.placed, g.direction[f], g.half, g.radius)
-                self._place(g, f, trial.least_overlap(low, high, BEST_OF, self.rng))
-            if more and self.apart:
-                jammed = not self._relax(queue[: done + more])
-                self._restore(queue[: done + (0 if jammed else more)])
+                placed[crowd.insert(np.flatnonzero(~placed), tries, self.rng)] = True
+            more = np.flatnonzero(~placed)[:batch]
+            crowd.squeeze(more, self.rng)
+            if len(more) and self.apart:
+                jammed = not self._relax(loose, freedom, np.append(np.flatnonzero(placed), more))
             if jammed and batch <= fewest:
-                self._jammed(queue[done][0].index, done, len(queue))
+                first = random[group[more[0]]].index
+                raise self._jammed(first, int(np.sum(placed)), n)
             if jammed:
                 batch = max(fewest, batch // 3)
             else:
-                done += more
-                self.squeezed += more
+                placed[more] = True
+                self.squeezed += len(more)
+            if self.apart and not np.all(placed):
+                self._fill(crowd, placed)
+        for k, g in enumerate(random):
+            mine = group == k
+            g.center, g.direction = loose.center[mine], loose.direction[mine]
+            g.tries += int(tries[mine].sum())
 
-    def _insert_free(self, queue: list[tuple[GroupFibers, int]]) -> int:
-        """Places fibers at free centers until there is none for one; how many."""
-        for k, (g, f) in enumerate(queue):
-            low, high = self.cell.center_range(g.direction[f], g.half, g.radius)
-            trial = Trial(self.placed, g.direction[f], g.half, g.radius)
-            center, tries = trial.free_center(low, high, self.rng, LINES)
-            g.tries += tries
-            if center is None:
-                return k
-            self._place(g, f, center)
-        return len(queue)
+    def _fill(self, crowd: Crowd, placed: NDArray[np.bool_]) -> None:
+        """Lists what is placed from the beginning."""
+        crowd.clear()
+        for capsules in [*self.held, crowd.loose.taken(np.flatnonzero(placed))]:
+            crowd.add(capsules)
 
-    def _place(self, g: GroupFibers, f: int, center: Floats) -> None:
-        g.center[f] = center
-        self.placed.add(center, g.direction[f], g.half, g.radius)
-
-    def _relax(self, done: list[tuple[GroupFibers, int]]) -> bool:
+    def _relax(self, loose: Capsules, freedom: Freedom, which: Ints) -> bool:
         """Parts overlapping fibers; False, and nothing moved, if they jam."""
-        loose = Capsules(
-            np.array([g.center[f] for g, f in done]),
-            np.array([g.direction[f] for g, f in done]),
-            np.array([g.half for g, _ in done]),
-            np.array([g.radius for g, _ in done]),
-            np.arange(len(done)),
+        capsules = _joined([loose.taken(which), *self.held])
+        n, more = len(which), len(capsules) - len(which)
+        free = Freedom(
+            np.append(freedom.translation[which], np.zeros(more)),
+            np.concatenate([freedom.rotation[which], np.zeros((more, 3, 3))]),
         )
-        capsules = _joined([loose, *self.held])
-        n = len(done)
-        freedom = Freedom(np.zeros(len(capsules)), np.zeros((len(capsules), 3, 3)))
-        freedom.translation[:n] = 1.0
-        freedom.rotation[:n] = np.array([g.turning for g, _ in done])
-        clear, sweeps = relax(capsules, self.cell, freedom, SWEEPS)
+        clear, sweeps = relax(capsules, self.cell, free, SWEEPS)
         self.sweeps += sweeps
         self.relaxations += 1
-        for k, (g, f) in enumerate(done if clear else []):
-            g.center[f] = capsules.center[k]
-            g.direction[f] = capsules.direction[k]
+        if clear:
+            center, size = capsules.center[:n], self.cell.size
+            if size is not None:
+                center -= np.where(self.cell.periodic, np.floor(center / size) * size, 0.0)
+            loose.center[which] = center
+            loose.direction[which] = capsules.direction[:n]
         return clear
 
-    def _jammed(self, index: int, placed: int, asked: int) -> None:
-        """Raises SceneError with how many fibers could be packed."""
+    def _jammed(self, index: int, placed: int, asked: int) -> SceneError:
+        """The fault that says how many fibers could be packed."""
         group = self.scene.fibers[index]
         reached = f"only about {placed} of {asked} fibers could be placed without overlap"
         remedy = "ask for less, or for shorter or more aligned fibers"
         if group.volume_fraction is None:
-            raise self._fault(index, "count", group.count, f"{reached}; {remedy}")
+            return self._fault(index, "count", group.count, f"{reached}; {remedy}")
         shares = [g.volume_fraction_achieved or 0.0 for g in self.scene.fibers]
         fraction = f"volume fraction {placed / asked * sum(shares):.3g} was reached"
-        raise self._fault(
+        return self._fault(
             index, "volume_fraction", group.volume_fraction, f"{reached}, {fraction}; {remedy}"
         )
-
-    def _restore(self, done: list[tuple[GroupFibers, int]]) -> None:
-        """Wraps centers into the box and lists all images again after fibers have moved."""
-        size, periodic = self.cell.size, self.cell.periodic
-        self.placed = Inserted(self.cell, self.longest, self.widest)
-        held, self.held = self.held, []
-        for capsules in held:
-            self._hold(capsules)
-        for g, f in done:
-            if size is not None:
-                g.center[f] -= np.where(periodic, np.floor(g.center[f] / size) * size, 0.0)
-            self.placed.add(g.center[f], g.direction[f], g.half, g.radius)
 
     def placement(self, began: float) -> Placement:
         """Nodes of all groups in the order of the scene, and the report."""

@@ -15,10 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpfiber.placement.capsules import Capsules, Floats, Ints, Pairs, axis_distance, near_pairs
-from warpfiber.placement.insertion import CLEARANCE, Cell, contact_distance, wall_distance
+from warpfiber.placement.space import CLEARANCE, Cell, contact_distance, wall_distance
 
 AIM = 3.0 * CLEARANCE
 """Relative distance aimed at; above the bar, so that the bar is met after finitely many sweeps."""
+WIDE = 2.0
+"""Skin of the list of near pairs, in diameters; twice the skin, half as many searches."""
+LAST = 12
+"""Sweeps that a list of the closest pairs is to last: shorter lists against fewer of them."""
 CHECK_EVERY = 250
 """Sweeps between two looks at the progress."""
 
@@ -51,18 +55,14 @@ def relax(capsules: Capsules, cell: Cell, freedom: Freedom, sweeps: int) -> tupl
     n = len(capsules)
     h, a = capsules.half, capsules.radius
     gyration = np.maximum(h / np.sqrt(3.0), a)
-    skin = 2.0 * float(a.max())
+    furthest = 0.4 * float(a.max())
     speed = np.zeros((n, 3))
     spin = np.zeros((n, 3))
     dt, mixing, downhill = 0.1, 0.1, 0
-    rows: Rows | None = None
-    anchor = capsules.center.copy(), capsules.direction.copy()
+    lists = _Lists(capsules, cell)
     before = np.inf
     for sweep in range(sweeps):
-        if rows is None or _moved(capsules, anchor) > 0.5 * skin:
-            rows = _rows(near_pairs(capsules, skin, cell.size, cell.periodic), capsules, cell)
-            anchor = capsules.center.copy(), capsules.direction.copy()
-        force, torque, energy, clear = _push(capsules, cell, rows)
+        force, torque, energy, clear = _push(capsules, cell, lists.touching(sweep))
         if clear:
             return True, sweep
         if sweep % CHECK_EVERY == 0:
@@ -88,13 +88,61 @@ def relax(capsules: Capsules, cell: Cell, freedom: Freedom, sweeps: int) -> tupl
         spin += dt * torque
         # No fiber jumps past a neighbor in one sweep.
         fastest = float(np.sqrt(np.max(np.sum(speed**2, axis=1) + np.sum(spin**2, axis=1))))
-        step = min(dt, 0.2 * skin / max(fastest, 1e-300))
+        step = min(dt, furthest / max(fastest, 1e-300))
         capsules.center += step * speed
         turned = capsules.direction + step * spin / gyration[:, None]
         capsules.direction[:] = turned / np.linalg.norm(turned, axis=1)[:, None]
         spin -= np.einsum("nk,nk->n", spin, capsules.direction)[:, None] * capsules.direction
         _keep_inside(capsules, cell, freedom)
     return False, sweeps
+
+
+class _Lists:
+    """Pairs that may touch: near ones, looked up seldom, and of those the closest.
+
+    Both are complete while no point has moved by half of what their skin leaves.
+    """
+
+    def __init__(self, capsules: Capsules, cell: Cell) -> None:
+        self.capsules, self.cell = capsules, cell
+        widest = 2.0 * float(capsules.radius.max())
+        self.wide = WIDE * widest
+        self.thin = 0.2 * self.wide
+        self.spare = 2.0 * AIM * widest
+        self.made = 0
+        self.near: Rows | None = None
+        self.close: Rows | None = None
+        self.anchor = self.near_anchor = capsules.center, capsules.direction
+
+    def touching(self, sweep: int) -> Rows:
+        """All pairs that push each other now."""
+        if self.close is None:
+            return self._renewed(sweep)
+        moved, lasted = _moved(self.capsules, self.anchor), sweep - self.made
+        if moved <= 0.5 * (self.thin - self.spare) and lasted < 2 * LAST:
+            return self.close
+        thin = 2.0 * moved * LAST / lasted + self.spare
+        self.thin = min(max(thin, 2.0 * self.spare), 0.5 * self.wide)
+        return self._renewed(sweep)
+
+    def _renewed(self, sweep: int) -> Rows:
+        self.made = sweep
+        capsules = self.capsules
+        self.anchor = capsules.center.copy(), capsules.direction.copy()
+        near = self.near
+        left = self.wide - self.spare - 2.0 * _moved(capsules, self.near_anchor)
+        # A search costs many sweeps: near pairs serve until they hardly leave a skin.
+        if near is not None and left > 0.4 * self.thin:
+            self.thin = min(self.thin, left)
+        else:
+            pairs = near_pairs(capsules, self.wide, self.cell.size, self.cell.periodic)
+            near = self.near = _rows(pairs, capsules, self.cell)
+            self.near_anchor = self.anchor
+        _, _, gap = _gaps(capsules, near)
+        distance = np.sqrt(np.einsum("nk,nk->n", gap, gap))
+        keep = np.flatnonzero(distance < near.reach + self.thin)
+        self.close = Rows(near.i[keep], near.j[keep], near.offset[keep], near.reach[keep])
+        return self.close
 
 
 def _moved(capsules: Capsules, anchor: tuple[Floats, Floats]) -> float:
@@ -110,14 +158,18 @@ def _rows(pairs: Pairs, capsules: Capsules, cell: Cell) -> Rows:
     return Rows(i, j, pairs.shift * edge, capsules.radius[i] + capsules.radius[j])
 
 
+def _gaps(capsules: Capsules, rows: Rows) -> tuple[Floats, Floats, Floats]:
+    i, j, p, h = rows.i, rows.j, capsules.direction, capsules.half
+    offset = capsules.center[i] - capsules.center[j] - rows.offset
+    return axis_distance(offset, p[i], h[i], p[j], h[j])
+
+
 def _push(capsules: Capsules, cell: Cell, rows: Rows) -> tuple[Floats, Floats, float, bool]:
     """Minus the gradients (m; m^2), the energy (m^2), and whether all distances are kept."""
     n = len(capsules)
     i, j = rows.i, rows.j
-    p, h = capsules.direction, capsules.half
-    s, t, gap = axis_distance(
-        capsules.center[i] - capsules.center[j] - rows.offset, p[i], h[i], p[j], h[j]
-    )
+    p = capsules.direction
+    s, t, gap = _gaps(capsules, rows)
     distance = np.sqrt(np.einsum("nk,nk->n", gap, gap))
     clear = not np.any(distance < contact_distance(rows.reach))
     missing = rows.reach * (1.0 + AIM) - distance
