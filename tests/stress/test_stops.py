@@ -86,7 +86,8 @@ def test_a_stopped_run_goes_on_bit_by_bit(
         _stop_after(patch, steps)
         assert shell.run("parts", text=CROWD) == 143
     assert shell.summary("parts")["outcome"] == "stopped"
-    assert shell.summary("parts")["steps"] == steps
+    # steps whose passes are timed are taken together
+    assert 0 <= shell.summary("parts")["steps"] - steps <= job_module.PROFILE_STEPS
     assert shell("resume", shell.folder / "parts", "--quiet") == 0
     _same(shell, "whole", "parts")
     assert shell.summary("parts")["outcome"] == "finished"

@@ -26,8 +26,8 @@ FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
     list_sizes groups pivots fiber_node_start fiber_group gradient deformation out_start in_start
-    in_pair pair_acts pair_force pair_closest pair_arm_i pair_arm_j list_pos node_pos node_velocity status
-    pair_i pair_j block_fiber block_own
+    in_pair pair_acts pair_force pair_closest pair_arm_i pair_arm_j list_pos node_pos node_velocity
+    status pair_i pair_j block_fiber block_own
 """.split()
 
 
