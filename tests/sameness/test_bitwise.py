@@ -127,6 +127,26 @@ def test_restore(start: Start, name: str, at: int) -> None:
 
 
 @pytest.mark.parametrize("name", CELLS)
+def test_restore_while_the_skin_changes(start: Start, name: str) -> None:
+    """The choice of the skin goes on from what it knew: same skins, builds and trajectory."""
+    run, slow = crowd(start, CELLS[name]), 0
+    first = run.method.list.skin
+    for at in (23, 61, 104):
+        run.step(at - slow)
+        slow = at
+        saved = run.snapshot()
+        again = crowd(start, CELLS[name], workers=2)
+        again.restore(saved)
+        whole = crowd(start, CELLS[name])
+        for sim in (again, whole):
+            sim.step(150 - sim.step_count)
+        assert_same(again, whole)
+        assert again.method.list.skin == whole.method.list.skin
+        assert whole.method.list.skin != first
+        assert whole.method.skin.saved().tobytes() == again.method.skin.saved().tobytes()
+
+
+@pytest.mark.parametrize("name", CELLS)
 def test_rewind(start: Start, name: str) -> None:
     """The same simulation, set back to an older snapshot, repeats itself."""
     sim = crowd(start, CELLS[name])

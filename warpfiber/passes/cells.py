@@ -37,8 +37,21 @@ class ListFeatures:
     pieces: bool = False
 
 
+# Cell order is random order in memory: what the pieces after this one need is asked for early.
+FETCH_AHEAD = r"""
+    const int far = k + 32, near = k + 16, last = order.shape[0] - 1;
+    const int e = order.data[far < last ? far : last];
+    __builtin_prefetch(piece_wrap.data + e);
+    __builtin_prefetch(segment_node.data + e);
+    const int soon = order.data[near < last ? near : last];
+    const char* x = (const char*)(node_pos.data + segment_node.data[soon]);
+    __builtin_prefetch(x);
+    __builtin_prefetch(x + 2 * sizeof(node_pos.data[0]) - 1);
+"""
+
+
 @cache
-def make_cell_kernels(name: str, features: ListFeatures):
+def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
     """`place_fibers`, `start_list`, `bin_pieces`, `gather_pieces` as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -76,6 +89,17 @@ def make_cell_kernels(name: str, features: ListFeatures):
     def middle_fraction(part: wp.int32) -> wp.float64:
         """Where along its segment the middle of a piece lies; `part` = number + 65536 count."""
         return (wp.float64(part % 65536) + half) / wp.float64(part / 65536)
+
+    ahead = native and not pieces  # CPU only
+
+    @wp.func_native(FETCH_AHEAD)
+    def fetch_ahead(
+        k: wp.int32,
+        order: wp.array(dtype=wp.int32),
+        piece_wrap: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        node_pos: wp.array(dtype=vec3),
+    ): ...
 
     @wp.kernel(**options)
     def place_fibers(
@@ -214,6 +238,8 @@ def make_cell_kernels(name: str, features: ListFeatures):
     ):
         """Copies in the order of the cells: the segment as it is, its piece wrapped in float32."""
         k = wp.tid() + offset
+        if wp.static(ahead):
+            fetch_ahead(k, order, piece_wrap, segment_node, node_pos)
         e = order[k]
         i = e
         if wp.static(pieces):

@@ -31,13 +31,18 @@ def load_kernel(kernel: Any, device: str) -> None:
 
 @dataclass
 class Launch:
-    """One kernel over `dim` items; `split` kernels take the offset of their first item first."""
+    """One kernel over `dim` items; `split` kernels take the offset of their first item first.
+
+    One that `follows` needs from the launch before only what the same worker made of it, so no
+    worker waits in between.
+    """
 
     name: str
     kernel: Any
     dim: int
     inputs: list[Any]
     split: bool = False
+    follows: bool = False
 
     def part(self, worker: int, workers: int) -> tuple[int, int]:
         """First item and number of items of one worker."""
@@ -66,6 +71,7 @@ class Call:
     name: str
     function: Callable[[], None]
     dim: int = 1
+    follows: bool = False
 
     def part(self, worker: int, workers: int) -> tuple[int, int]:
         """First item and number of items of one worker."""
@@ -93,7 +99,13 @@ class Executor:
         self.batches = items < BATCH_BELOW or not device.startswith("cpu")
         self._pool: _Workers | None = None
         if self.workers > 1:
-            phases = [self._capture_phase(launch) for launch in self.launches]
+            groups: list[list[Launch | Call]] = []
+            for launch in self.launches:
+                if launch.follows and groups:
+                    groups[-1].append(launch)
+                else:
+                    groups.append([launch])
+            phases = [self._capture_phase(group) for group in groups]
             self._pool = _Workers(phases, self.workers)
         else:
             self._single = self._capture_steps(1)
@@ -106,14 +118,15 @@ class Executor:
                     launch.run(self.device)
         return capture.graph
 
-    def _capture_phase(self, launch: Launch | Call) -> list[Any]:
+    def _capture_phase(self, group: list[Launch | Call]) -> list[Any]:
         graphs: list[Any] = []
         for worker in range(self.workers):
-            if launch.part(worker, self.workers)[1] == 0:
+            if all(launch.part(worker, self.workers)[1] == 0 for launch in group):
                 graphs.append(None)
                 continue
             with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                launch.run(self.device, worker, self.workers)
+                for launch in group:
+                    launch.run(self.device, worker, self.workers)
             graphs.append(capture.graph)
         return graphs
 

@@ -23,8 +23,15 @@ def list_launches(pairs: NeighborList) -> Launches:
     return [*_bin(pairs), *_plain_sort(pairs), _gather(pairs), *_plain_pairs(pairs)]
 
 
-def _launch(pairs: NeighborList, name: str, dim: int, *inputs: Any, split: bool = True) -> Launch:
-    return Launch(name, pairs.kernels[name], dim, list(inputs), split=split)
+def _launch(
+    pairs: NeighborList,
+    name: str,
+    dim: int,
+    *inputs: Any,
+    split: bool = True,
+    follows: bool = False,
+) -> Launch:
+    return Launch(name, pairs.kernels[name], dim, list(inputs), split=split, follows=follows)
 
 
 def _bin(pairs: NeighborList) -> Launches:
@@ -34,6 +41,7 @@ def _bin(pairs: NeighborList) -> Launches:
             pairs,
             "place_fibers",
             model.fiber_count,
+            0,
             pairs.wraps,
             state.lattice,
             state.gradient,
@@ -42,6 +50,7 @@ def _bin(pairs: NeighborList) -> Launches:
             state.node_velocity,
             state.fiber_image,
             state.list_pos,
+            split=False,
         ),
         _launch(
             pairs,
@@ -99,20 +108,23 @@ def _gather(pairs: NeighborList) -> Launch:
     )
 
 
-# -- CPU: native search and sorts, one item per worker --------------------------------------------
+# -- CPU: native search and sorts -----------------------------------------------------------------
+# Only what takes longer than waking the other workers is split; the sorts could be.
 
 
 def _native_sort(pairs: NeighborList) -> Launch:
     return _launch(
         pairs,
         "sort_cells",
-        pairs.workers,
-        pairs.workers,
+        1,
+        0,
+        1,
         pairs.cells,
         pairs.piece_total,
         pairs.cell_key,
         pairs.cell_start,
         pairs.order,
+        split=False,
     )
 
 
@@ -157,11 +169,14 @@ def _native_pairs(pairs: NeighborList) -> Launches:
             pairs.sorted_part,
             pairs.found_count,
             *found,
+            follows=True,
         ),
         _launch(
             pairs,
             "order_rows",
-            workers,
+            1,
+            0,
+            1,
             workers,
             model.segment_count,
             pairs.region,
@@ -172,18 +187,21 @@ def _native_pairs(pairs: NeighborList) -> Launches:
             pairs.out_start,
             pairs.pair_slot,
             *listed,
+            split=False,
         ),
         _launch(
             pairs,
             "index_partners",
-            workers,
-            workers,
+            1,
+            0,
+            1,
             model.segment_count,
             state.status,
             pairs.pair_j,
             pairs.in_start,
             pairs.in_pair,
             state.status[PAIR_COUNT : PAIR_COUNT + 1],
+            split=False,
         ),
     ]
 

@@ -149,6 +149,7 @@ def make_sort_kernels():
     def order_rows(
         offset: wp.int32,
         workers: wp.int32,
+        regions: wp.int32,
         bins: wp.int32,
         stride: wp.int32,
         capacity: wp.int32,
@@ -168,7 +169,7 @@ def make_sort_kernels():
             wp.tid() + offset,
             workers,
             bins,
-            workers,
+            regions,
             stride,
             capacity,
             count,

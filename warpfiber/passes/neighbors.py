@@ -82,7 +82,7 @@ class NeighborList:
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
         features = ListFeatures(domain.periodic, domain.shear_axes, domain.sheared, has_pieces)
-        self.kernels = dict(make_cell_kernels(name, features))  # the one made is shared
+        self.kernels = dict(make_cell_kernels(name, features, self.native))  # cached: copy
         if self.native:
             self.kernels |= make_search_kernels(name, domain.periodic, has_pieces)
             self.kernels |= make_sort_kernels()
