@@ -7,90 +7,20 @@ to what relaxation turns.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
 
-from warpfiber.placement import Placement, overlap_of, place_fibers
-from warpfiber.placement.capsules import Capsules, near_pairs
-from warpfiber.placement.insertion import Crowd
+from tests.placed import DIAMETER, PERIODIC, cube_edge, ends, made_scene, segment_distance
+from warpfiber.placement import Placement, place_fibers
 from warpfiber.placement.orientations import (
     orientation_tensor,
     values_from_tensor,
 )
-from warpfiber.placement.space import Cell
-from warpfiber.scene import Scene, SceneError, scene_from_dict
+from warpfiber.scene import Scene, SceneError
 
-DIAMETER = 1e-5
-PERIODIC = ("periodic", "periodic", "periodic")
 ALONG = {"orientation": "aligned", "direction": [1, 1, 0]}
 SHEAR_CELL = ("periodic", "periodic", "wall")
-
-
-def made_scene(
-    *groups: dict[str, Any],
-    edge: float | tuple[float, float, float] | None = 5e-4,
-    boundary: tuple[str, str, str] = PERIODIC,
-    law: str = "exponential",
-    segments: int | list[int] | None = 3,
-    seed: int = 1,
-) -> Scene:
-    """A scene with these fiber groups; edge (m), None = no box."""
-    common = {"diameter": DIAMETER, "density": 4e9, "youngs_modulus": 1e9}
-    tables: dict[str, Any] = {
-        "seed": seed,
-        "flow": {"kind": "simple_shear", "shear_rate": 100.0, "viscosity": 100.0},
-        "fibers": [{**common, **group} for group in groups],
-        "contact": {"law": law},
-        "stage": [{"kind": "flow", "end_strain": 1.0}],
-        "numerics": {"method": "bead_chain"},
-    }
-    if segments is not None:
-        tables["numerics"]["segments"] = segments
-    if edge is not None:
-        size = [edge] * 3 if isinstance(edge, float) else list(edge)
-        tables["box"] = {"size": size, "boundary": list(boundary)}
-    return scene_from_dict(tables)
-
-
-def cube_edge(count: int, aspect_ratio: float, volume_fraction: float) -> float:
-    """Edge of the cube (m) that `count` fibers fill to this volume fraction."""
-    volume = count * 0.25 * np.pi * DIAMETER**3 * aspect_ratio
-    return float((volume / volume_fraction) ** (1.0 / 3.0))
-
-
-def ends(placed: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """First and last node of every fiber (m), checking that the nodes lie evenly between them."""
-    start = placed.fiber_node_start
-    first, last = placed.node_pos[start[:-1]], placed.node_pos[start[1:] - 1]
-    for f in range(len(start) - 1):
-        nodes = placed.node_pos[start[f] : start[f + 1]]
-        even = first[f] + np.linspace(0.0, 1.0, len(nodes))[:, None] * (last[f] - first[f])
-        np.testing.assert_allclose(nodes, even, atol=1e-12)
-    return first, last
-
-
-def point_distance(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distance of points x from segments a b."""
-    t = np.sum((x - a) * (b - a), axis=-1) / np.sum((b - a) ** 2, axis=-1)
-    return np.linalg.norm(x - a - np.clip(t, 0.0, 1.0)[..., None] * (b - a), axis=-1)
-
-
-def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Distance of segments a b and c d: four end distances, or the lines' own."""
-    best = np.minimum(point_distance(a, c, d), point_distance(b, c, d))
-    best = np.minimum(best, np.minimum(point_distance(c, a, b), point_distance(d, a, b)))
-    u, v, w = b - a, d - c, a - c
-    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
-    det = uu * vv - uv**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (uv * (v * w).sum(-1) - vv * (u * w).sum(-1)) / det
-        t = (uu * (v * w).sum(-1) - uv * (u * w).sum(-1)) / det
-    inside = (det > 1e-12 * uu * vv) & (s > 0) & (s < 1) & (t > 0) & (t < 1)
-    s, t = np.where(inside, s, 0.0), np.where(inside, t, 0.0)
-    line = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
-    return np.where(inside, line, best)
 
 
 def assert_apart(scene: Scene, placed: Placement, images: int = 1) -> None:
@@ -331,108 +261,3 @@ def test_given_tensor_is_reached() -> None:
     np.testing.assert_allclose(
         values_from_tensor(tensor_of(place_fibers(scene))), values, atol=1e-9
     )
-
-
-# ------------------------------------------------------------------- neighbor pairs, free lines
-
-
-def test_near_pairs_against_all_pairs() -> None:
-    rng = np.random.default_rng(3)
-    n, size = 60, np.array([30.0, 20.0, 25.0])
-    p = rng.normal(size=(n, 3))
-    p /= np.linalg.norm(p, axis=1)[:, None]
-    p[:10] = [0.0, 1.0, 0.0]
-    half = rng.uniform(0.0, 14.0, n)
-    capsules = Capsules(rng.uniform(-20, 20, (n, 3)), p, half, np.ones(n), np.arange(n))
-    for periodic in ([True] * 3, [True, False, True], [False] * 3):
-        pairs = near_pairs(capsules, 0.5, size, np.array(periodic))
-        found = set()
-        for i, j, shift in zip(pairs.i, pairs.j, pairs.shift, strict=True):
-            found.add((int(i), int(j), *(int(x) for x in shift)))
-        assert len(found) == len(pairs.i)
-        a, b = capsules.center - half[:, None] * p, capsules.center + half[:, None] * p
-        expected = set()
-        i, j = np.triu_indices(n)
-        for shift in product(*[range(-4, 5) if x else range(1) for x in periodic]):
-            offset = np.array(shift) * size
-            with np.errstate(invalid="ignore", divide="ignore"):
-                d = segment_distance(a[i], b[i], a[j] + offset, b[j] + offset)
-            for k in np.flatnonzero(d < 2.5):
-                if i[k] < j[k] or (i[k] == j[k] and shift > (0, 0, 0)):
-                    expected.add((int(i[k]), int(j[k]), *shift))
-        assert found == expected
-
-
-def test_overlap_of_known_pairs() -> None:
-    a = 1.0
-    rows = [[0, 0, 0], [10, 0, 0], [5, -5, 1.5], [5, 5, 1.5], [0, 0, 50], [10, 0, 50]]
-    cell = Cell(None, np.zeros(3, bool), np.zeros(3, bool))
-    overlap = overlap_of(np.array(rows, float), np.array([0, 2, 4, 6]), np.full(3, a), cell)
-    assert overlap == pytest.approx({"pairs": 1, "maximum": 0.5, "mean": 0.5})
-
-
-def random_capsules(n: int, size: np.ndarray, rng: np.random.Generator) -> Capsules:
-    """Rods of half lengths up to 9 with centers in the box."""
-    p = rng.normal(size=(n, 3))
-    p /= np.linalg.norm(p, axis=1)[:, None]
-    return Capsules(rng.random((n, 3)) * size, p, rng.uniform(0, 9, n), np.ones(n), np.arange(n))
-
-
-@pytest.mark.parametrize("periodic", [(True, True, True), (True, False, False)])
-def test_candidates_against_all_pairs(periodic: tuple[bool, bool, bool]) -> None:
-    """Overlaps of candidates are those of the formula, and voxels reject nothing else."""
-    rng = np.random.default_rng(5)
-    size, mask = np.array([30.0, 20.0, 25.0]), np.array(periodic)
-    old, new = random_capsules(40, size, rng), random_capsules(500, size, rng)
-    old.radius[:20] = 0.7
-    crowd = Crowd(Cell(size, mask, np.zeros(3, bool)), new)
-    crowd.add(old.taken(np.arange(25)))
-    crowd.add(old.taken(np.arange(25, 40)))
-    expected = []
-    i, j = (x.ravel() for x in np.indices((len(new), len(old))))
-    tips = [c.center + s * c.half[:, None] * c.direction for c in (new, old) for s in (-1, 1)]
-    for shift in product(*[range(-3, 4) if x else range(1) for x in periodic]):
-        offset = np.array(shift) * size
-        with np.errstate(invalid="ignore", divide="ignore"):
-            d = segment_distance(tips[0][i], tips[1][i], tips[2][j] + offset, tips[3][j] + offset)
-        missing = (new.radius[i] + old.radius[j]) * (1.0 + 1.001e-3) - d
-        expected += [(int(i[k]), float(missing[k])) for k in np.flatnonzero(missing > 0.0)]
-    row, missing = crowd.overlaps(new)
-    found = sorted(zip(row.tolist(), missing.tolist(), strict=True))
-    np.testing.assert_allclose(found, sorted(expected), atol=1e-12)
-    blocked = np.setdiff1d(np.arange(500), crowd.voxels.passed(new.center, new.direction, new.half))
-    assert len(blocked) > 100
-    assert set(blocked) <= set(row)
-    part = crowd.voxels.blocked_parts(new.center, new.direction, new.half)
-    assert set(np.flatnonzero(part)) <= set(row)
-
-
-def test_free_centers_are_even() -> None:
-    """The centers found are free and spread over the free part of the box."""
-    size = np.full(3, 40.0)
-    one = np.zeros(1, dtype=np.int64)
-    held = Capsules(np.array([[20.0, 20.0, 5.0]]), np.eye(3)[:1], np.full(1, 9.0), np.ones(1), one)
-    loose = held.taken(one)
-    loose.direction[:] = [0.6, 0.8, 0.0]
-    crowd = Crowd(Cell(size, np.ones(3, bool), np.zeros(3, bool)), loose)
-    rng = np.random.default_rng(1)
-    z = []
-    for _ in range(1000):
-        crowd.clear()
-        crowd.add(held)
-        assert len(crowd.insert(one, np.zeros(1, dtype=np.int64), rng)) == 1
-        z.append(loose.center[0, 2])
-    # z is across both fibers: above their layer it is uniform.
-    above = np.array([x for x in z if 10.0 < x < 40.0])
-    assert np.mean(above) == pytest.approx(25.0, abs=5 * 30 / np.sqrt(12 * len(above)))
-
-
-def test_centers_fill_all_blocks_alike() -> None:
-    """Hard particles are never more uneven than free points: chi-square to five deviations."""
-    group = {"aspect_ratio": 20, "volume_fraction": 0.1}
-    edge = cube_edge(2000, 20, 0.1)
-    middle = 0.5 * sum(ends(place_fibers(made_scene(group, edge=edge))))
-    assert len(middle) == 2000
-    block = np.floor(4 * middle / edge).astype(int)
-    count = np.bincount(block @ [16, 4, 1], minlength=64)
-    assert np.sum((count - 2000 / 64) ** 2) / (2000 / 64) < 63 + 5 * np.sqrt(2 * 63)

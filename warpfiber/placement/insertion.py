@@ -3,7 +3,8 @@
 Fibers go in by groups: all of a group draw centers, those that are free of everything placed are
 kept, and of two new fibers in each other's way the later one draws again.
 
-Source: random sequential addition, in the order of the group instead of one by one.
+Source: random sequential addition, in the order of the group instead of one by one. Voxels reject
+    most centers, cells find the neighbors of the rest.
 Limits: a fiber that finds no center in TRIES is set aside: it goes in later, or overlapping.
 """
 
@@ -16,7 +17,7 @@ from warpfiber.placement.cells import Entries, make_grid, matches, shift_of
 from warpfiber.placement.space import CLEARANCE, Cell, contact_distance
 from warpfiber.placement.voxels import Voxels
 
-TRIES = 4096
+TRIES = 8192
 """Random centers tried for one fiber before it is set aside."""
 FIRST_TRIES = 4
 """Centers per fiber in the first draw; each next draw takes twice as many."""
@@ -47,7 +48,7 @@ class Crowd:
         self.low = np.zeros((len(loose), 3))
         if np.any(cell.wall):
             reach = loose.half[:, None] * np.abs(loose.direction)
-            reach += contact_distance(loose.radius)[:, None]
+            reach += contact_distance(loose.radius)[:, None]  # of a wall and an axis, too
             self.low = np.where(cell.wall, reach, 0.0)
         self.clear()
 

@@ -26,13 +26,6 @@ class Cell:
     periodic: NDArray[np.bool_]
     wall: NDArray[np.bool_]
 
-    def center_range(self, direction: Floats, half: float, radius: float) -> tuple[Floats, Floats]:
-        """Lowest and highest center (3,) m of a fiber that stays off the walls."""
-        if self.size is None:
-            return np.zeros(3), np.zeros(3)
-        reach = np.where(self.wall, half * np.abs(direction) + wall_distance(radius), 0.0)
-        return reach, self.size - reach
-
 
 def wall_distance(radius: float) -> float:
     """Smallest distance of a centerline from a wall (m); a little above the bar, for rounding."""
