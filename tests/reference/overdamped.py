@@ -2,7 +2,7 @@
 
 Source: balance of bead drag 6 pi eta a and bead torque 8 pi eta a^3 on the unreduced chain,
     projected on hat functions; stretching k_s (L - l)^2/2 with the tension as a state variable;
-    bending k_b/(2 l^2) sum |x_{i+1} - 2 x_i + x_{i-1}|^2 (straight rest shape).
+    bending k_b/(2 l^2) sum |x_{i+1} - 2 x_i + x_{i-1}|^2 (straight rest shape), or k_b theta^2/2.
 Symbols: R = zeta A (x) I_3 drag, T(x) = sum tau_s P_s (x) G_s torque, P = I - n n^T,
     G_s = [[1, -1], [-1, 1]] on the nodes of segment s, B bending matrix; lambda tension of a
     segment; h effective step, x* guess (`guess`), delta = x_new - x*; Lambda = h lambda;
@@ -19,8 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from .bead_chain import Array, Chain, segment_geometry
+from .bead_chain import bending_force as angle_bending_force
 
 FORMS = ("primal", "compliant", "inextensible")
+BENDINGS = ("difference", "angle")
 
 
 class Fiber(NamedTuple):
@@ -29,6 +31,7 @@ class Fiber(NamedTuple):
     chain: Chain
     gradient: Array  # (3, 3), u = L x
     form: str = "primal"
+    bending: str = "difference"  # or "angle": k_b theta^2/2
 
 
 class Shape(NamedTuple):
@@ -112,6 +115,13 @@ def bending_energy(chain: Chain, node_pos: Array) -> float:
     return float(0.5 * chain.bending_stiffness / chain.rest_length**2 * np.sum(bend**2))
 
 
+def bending_force(fiber: Fiber, node_pos: Array) -> Array:
+    """-B x, or the gradient of k_b theta^2/2 of every joint; (n, 3)."""
+    if fiber.bending == "angle":
+        return angle_bending_force(fiber.chain, *segment_geometry(node_pos))
+    return -(bending_matrix(fiber.chain) @ node_pos.ravel()).reshape(-1, 3)
+
+
 def elastic_tension(chain: Chain, node_pos: Array) -> Array:
     """k_s (L_s - l); (N_seg,)."""
     _, length = segment_geometry(node_pos)
@@ -133,8 +143,8 @@ def velocity(fiber: Fiber, shape: Shape, force: Array | None = None) -> Array:
     drag = drag_matrix(chain)
     right = torque_couple(chain, x, fiber.gradient) + tension_force(axis, shape.tension)
     right = right if force is None else right + force
+    right = right + bending_force(fiber, x)
     total = drag @ (x @ fiber.gradient.T).ravel() + right.ravel()
-    total -= bending_matrix(chain) @ x.ravel()
     return np.linalg.solve(drag + torque_matrix(chain, x), total).reshape(-1, 3)
 
 
@@ -159,15 +169,18 @@ def linearize(
     tension: Array,
     force: Array | None = None,
 ) -> StepProblem:
-    """Linearization at x* = `guess` with carried `tension` of x = base + h v(x)."""
+    """Linearization at x* = `guess` with carried `tension` of x = base + h v(x).
+
+    Both bending laws keep B in the matrix, so it stays constant.
+    """
     chain = fiber.chain
     axis, length = segment_geometry(guess)
     drag, bending = drag_matrix(chain), bending_matrix(chain)
     resist = drag + torque_matrix(chain, guess)
     across = (tension / length)[:, None, None] * (np.eye(3) - outer(axis))
-    nodal = torque_couple(chain, guess, fiber.gradient)
+    nodal = torque_couple(chain, guess, fiber.gradient) + bending_force(fiber, guess)
     nodal = nodal if force is None else nodal + force
-    rate = drag @ (guess @ fiber.gradient.T).ravel() + nodal.ravel() - bending @ guess.ravel()
+    rate = drag @ (guess @ fiber.gradient.T).ravel() + nodal.ravel()
     return StepProblem(
         fiber,
         h,
