@@ -273,7 +273,7 @@ def suspensions(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def suspension(scene: wf.Scene, args: argparse.Namespace) -> dict[str, Any]:
     """One run: means over the second half of the strain."""
     simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
-    simulation.method.prepare()
+    simulation.prepare()
     begin = time.perf_counter()
     rows: list[dict[str, float]] = []
     for strain in np.linspace(0.0, args.strain, 301):

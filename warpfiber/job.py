@@ -142,7 +142,7 @@ class Job:
         code = 0
         with contextlib.nullcontext(stopper) if stopper else Stopper() as stopper:
             try:
-                self.simulation.method.prepare()
+                self.simulation.prepare()
                 self.summary.begin()
                 self._record_due()
                 self._keep_good()

@@ -133,6 +133,10 @@ class Simulation:
 
     # -- stepping ---------------------------------------------------------------------------------
 
+    def prepare(self) -> None:
+        """Compile everything that the run needs and build the first list."""
+        self.method.prepare(self.measurement.kernels(self.method.list))
+
     def step(self, count: int = 1) -> None:
         """Advance `count` steps of dt.
 
@@ -258,7 +262,7 @@ class Simulation:
 
     def measure(self) -> dict[str, float]:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
-        self.method.prepare()
+        self.prepare()
         row = {"step": self.step_count, "time": self.time, "strain": self.strain}
         return row | self.measurement.row(self.method.list)
 
@@ -266,7 +270,7 @@ class Simulation:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of every array that the next step depends on, in run units and full precision."""
-        self.method.prepare()
+        self.prepare()
         arrays = {name: getattr(self.state, name).numpy().copy() for name in _ARRAYS}
         if self.method.list is not None and self.method.skin is not None:
             arrays["stretch_allowed"] = np.asarray(self.method.list.stretch_allowed)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from warpfiber.methods.box_limits import bearable_strain, lasting_height
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
 from warpfiber.model import BAD_FIBER, EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
-from warpfiber.passes.executor import Executor
+from warpfiber.passes.executor import Executor, load_kernels
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
@@ -232,8 +233,15 @@ class BeadChain:
         }
         return report | pairs.search_counts()
 
-    def prepare(self) -> None:
-        """Compile, build the first list and capture, so that the next `advance` only steps."""
+    def prepare(self, measuring: Iterable[Any] = ()) -> None:
+        """Compile, build the first list and capture, so that the next `advance` only steps.
+
+        `measuring`: further kernels of the run, compiled along with these.
+        """
+        if self.executor is None:
+            stepping = [launch.kernel for launch in step_launches(self)]
+            listing = self.list.kernels.values() if self.list is not None else ()
+            load_kernels([*stepping, *listing, *measuring], self.model.device)
         if self.list is not None and self.list.build_count == 0:
             self.refresh_list()
         if self.executor is None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,10 +23,12 @@ BATCH = 16  # steps per graph where looking after every step would cost more tha
 BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
 
 
-def load_kernel(kernel: Any, device: str) -> None:
-    """Compile or load a kernel for the block size that `wp.launch` will use on this device."""
+def load_kernels(kernels: Iterable[Any], device: str) -> None:
+    """Compile or load kernels, several at a time, for the block size of `wp.launch`."""
+    modules = list(dict.fromkeys(kernel.module for kernel in kernels))
     target = wp.get_device(device)
-    kernel.module.load(target, block_dim=1 if target.is_cpu else 256)
+    if modules:
+        wp.force_load(target, modules=modules, block_dim=1 if target.is_cpu else 256)
 
 
 @dataclass
@@ -59,10 +61,6 @@ class Launch:
         inputs = [begin, *self.inputs] if self.split else self.inputs
         wp.launch(self.kernel, dim=count, inputs=inputs, device=device)
 
-    def load(self, device: str) -> None:
-        """Compile or load the kernel's module, which must not happen inside a capture."""
-        load_kernel(self.kernel, device)
-
 
 @dataclass
 class Call:
@@ -82,9 +80,6 @@ class Call:
         if worker == 0:
             self.function()
 
-    def load(self, device: str) -> None:
-        """Nothing to compile."""
-
 
 class Executor:
     """Replays the steps made of `launches`."""
@@ -93,8 +88,8 @@ class Executor:
         self.launches = [launch for launch in launches if launch.dim > 0]
         self.device = device
         self.workers = max(1, workers)
-        for launch in self.launches:
-            launch.load(device)
+        # nothing may be compiled inside a capture
+        load_kernels((x.kernel for x in self.launches if isinstance(x, Launch)), device)
         items = sum(launch.dim for launch in self.launches)
         self.batches = items < BATCH_BELOW or not device.startswith("cpu")
         self._pool: _Workers | None = None

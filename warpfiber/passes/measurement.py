@@ -30,6 +30,7 @@ from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import PairFeatures
 
 CHUNKS = 256
+FIBER_QUANTITIES = {"orientation", "orientation4", "axial_strain", "energy", "curvature"}
 PAIR_QUANTITIES = {"contacts", "interactions", "overlap"}
 
 
@@ -53,11 +54,20 @@ class Measurement:
         if "rotation" in self.quantities:
             self.angle = self._axis_angle()
 
+    def kernels(self, pairs: NeighborList | None) -> list[Any]:
+        """The kernels that `row` will launch."""
+        found = []
+        if self.quantities & FIBER_QUANTITIES:
+            found.append(make_measure_fibers(self.model.precision.name, self._fiber_features()))
+        if pairs is not None and self.quantities & (PAIR_QUANTITIES | {"energy"}):
+            found.append(make_measure_pairs(self.model.precision.name, self.pair_features))
+        return found
+
     def row(self, pairs: NeighborList | None) -> dict[str, float]:
         """All asked quantities now, in SI (overlaps in radii)."""
         row: dict[str, float] = {}
         wanted = self.quantities
-        if wanted & {"orientation", "orientation4", "axial_strain", "energy", "curvature"}:
+        if wanted & FIBER_QUANTITIES:
             row |= self._fiber_row()
         if wanted & PAIR_QUANTITIES or ("energy" in wanted and pairs is not None):
             row |= self._pair_row(pairs)
@@ -85,14 +95,18 @@ class Measurement:
         )
         return total.numpy().sum(axis=0), largest.numpy().max(axis=0)
 
-    def _fiber_row(self) -> dict[str, float]:
-        model, state, wanted = self.model, self.state, self.quantities
-        features = MeasureFeatures(
+    def _fiber_features(self) -> MeasureFeatures:
+        wanted, no_walls = self.quantities, (False, False, False)
+        return MeasureFeatures(
             orientation4="orientation4" in wanted,
             energy="energy" in wanted,
             curvature="curvature" in wanted,
-            walls=model.domain.wall if self.strength > 0.0 else (False, False, False),
+            walls=self.model.domain.wall if self.strength > 0.0 else no_walls,
         )
+
+    def _fiber_row(self) -> dict[str, float]:
+        model, state, wanted = self.model, self.state, self.quantities
+        features = self._fiber_features()
         p, low = model.precision, np.asarray(model.domain.low)
         columns = len(FIBER_SUMS) + (len(TENSOR4) if features.orientation4 else 0)
         values, largest = self._sums(
