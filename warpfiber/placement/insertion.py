@@ -77,6 +77,8 @@ class Crowd:
     def overlaps(self, new: Capsules) -> tuple[Ints, Floats]:
         """Row and missing distance (m, > 0) of every overlap of candidates with what is placed."""
         asked = self._entries(new)
+        # In the order of the table, its rows are read one after the other.
+        asked = asked.taken(np.argsort(asked.key, kind="stable"))
         lo = np.searchsorted(self.table.key, asked.key, side="left")
         count = np.searchsorted(self.table.key, asked.key, side="right") - lo
         rows, whom, codes, missing = [], [], [], []
