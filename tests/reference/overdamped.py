@@ -14,6 +14,7 @@ Limits: open fibers, u = L x, `consistent` drag only; twist is dropped.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,7 @@ def outer(axis: Array) -> Array:
     return axis[:, :, None] * axis[:, None, :]
 
 
+@lru_cache(maxsize=16)
 def drag_matrix(chain: Chain) -> Array:
     """R = zeta A (x) I_3; (3n, 3n)."""
     return np.kron(chain.drag * chain.matrix, np.eye(3))
@@ -103,6 +105,7 @@ def second_difference(count: int) -> Array:
     return rows
 
 
+@lru_cache(maxsize=16)
 def bending_matrix(chain: Chain) -> Array:
     """B = k_b/l^2 D_2^T D_2 (x) I_3; (3n, 3n)."""
     d2 = second_difference(chain.segments + 1)

@@ -144,6 +144,22 @@ def test_elimination_with_multipliers(form: str, modulus: float) -> None:
     assert (pivots > 0.0).sum() == 21 and (pivots < 0.0).sum() == 6
 
 
+def test_compression_makes_the_matrix_indefinite() -> None:
+    """Buckling within a step shows in the sign of a pivot; without compression there is none."""
+    chain = bc.Chain(6, 2.0, modulus=100.0, bending_modulus=0.0)
+    fiber = od.Fiber(chain, GRADIENT)
+    x = bc.arc_nodes(chain, 0.3)
+    smallest = []
+    for tension in (-500.0, 0.0):
+        problem = od.linearize(fiber, 1.0, x, x, np.full(6, tension))
+        matrix, right = od.primal_system(problem)
+        found, pivots = el.solve_in_order(matrix, right)
+        smallest.append(pivots.min())
+        assert (pivots < 0.0).sum() == (np.linalg.eigvalsh(matrix) < 0.0).sum()
+        assert np.abs(found - np.linalg.solve(matrix, right)).max() < 1e-9 * np.abs(found).max()
+    assert smallest[0] < 0.0 < smallest[1]
+
+
 @pytest.mark.parametrize("modulus", [1.0, 1e3, 2e7])
 def test_multipliers_give_the_primal_step(modulus: float) -> None:
     fiber, shape = bent_fiber(np.random.default_rng(6), 6, 2.0, modulus=modulus)

@@ -299,6 +299,34 @@ def test_pair_passing_in_shear() -> None:
     assert np.abs(ends[2] - ends[1]).max() < 0.7 * np.abs(ends[1] - ends[0]).max()
 
 
+def test_cluster_in_shear() -> None:
+    """Ten rods through each other's way: hardly an overlap, and one motion with both solvers."""
+    rng = np.random.default_rng(11)
+    rods = random_rods(rng, 1, 9.0)
+    while len(rods.center) < 10:
+        more = random_rods(rng, 1, 9.0)
+        both = rods._replace(
+            center=np.concatenate([rods.center, more.center]),
+            axis=np.concatenate([rods.axis, more.axis]),
+            beads=np.concatenate([rods.beads, more.beads]),
+        )
+        rods = both if overlap(both) == 0.0 else rods
+    ends, loaded = [], 0
+    for solver in (un.sweep_tightly, lambda dual: du.solve_gradients(dual, 1e-9)):
+        now = rods
+        for _ in range(30):
+            step = un.step_rods(now, SHEAR, 0.05, un.Obstacles(solver=solver))
+            now = step.rods
+            loaded = max(loaded, int((step.force > 1e-9).sum()))
+            assert overlap(now) < 0.02
+        ends.append(now)
+    assert loaded >= 3
+    assert np.abs(ends[0].center - ends[1].center).max() < 1e-6
+    # Equal rods: the mean of the centers is carried as if there were no contact.
+    mean = rods.center.mean(axis=0)
+    assert np.abs(ends[0].center.mean(axis=0) - mean - 1.5 * SHEAR @ mean).max() < 1e-11
+
+
 def test_images_carry_the_flow() -> None:
     """A pair across the sheared face is the pair inside, moved by a box vector."""
     lattice = np.array([[30.0, 0, 4.0], [0, 30.0, 0], [0, 0, 30.0]])

@@ -114,3 +114,31 @@ def test_response_diagonal_of_fibers() -> None:
     assert gap.min() > -1e-10
     assert step.force.min() >= 0.0
     assert np.abs(gap * step.force).max() < 1e-9
+
+
+@pytest.mark.parametrize("lubricated", [False, True])
+def test_bent_fibers_in_shear(lubricated: bool) -> None:
+    """Three soft fibers and a wall: hardly an overlap, one motion with both solvers."""
+    chain = bc.Chain(5, 2.0, modulus=2e3)
+    shear = bc.shear_gradient(1.0)
+    fibers = [od.Fiber(chain, shear)] * 3
+    start = []
+    for axis, center in ((X + 0.4 * Z, 6 * Z), (X - 0.3 * Y, 9 * Z - 8 * X), (Y, 8 * Z + 9 * X)):
+        start.append(od.Shape(bc.straight_nodes(chain, axis, center), np.zeros(5)))
+    ends = []
+    for solver in (un.sweep_tightly, lambda dual: du.solve_gradients(dual, 1e-10)):
+        obstacles = un.Obstacles(walls=FLOOR, lubricated=lubricated, solver=solver)
+        now, pushed = start, 0.0
+        for _ in range(40):
+            step = un.step_fibers(fibers, now, 0.1, obstacles)
+            now = step.shapes
+            dry = [f for f, r in zip(step.force, step.rows, strict=True) if r.coefficient == 0.0]
+            pushed = max(pushed, max(dry, default=0.0))
+            assert min(dry, default=0.0) >= 0.0
+            problems = [od.linearize(f, 0.1, s.node_pos, s.node_pos, s.tension)
+                        for f, s in zip(fibers, now, strict=True)]  # fmt: skip
+            gaps = [row.gap for row in un.fiber_rows(problems, obstacles) if row.coefficient == 0.0]
+            assert min(gaps) > -0.05
+        assert pushed > 1.0
+        ends.append(np.concatenate([s.node_pos for s in now]))
+    assert np.abs(ends[0] - ends[1]).max() < 1e-5
