@@ -269,6 +269,19 @@ def test_error_estimate_is_the_distance_to_first_order() -> None:
     assert np.abs(whole - new.node_pos).max() < 1e-12
 
 
+def test_rule_of_the_next_step() -> None:
+    for error, accepted, factor in (
+        (1.0, True, 0.85),
+        (0.25, True, 1.7),
+        (0.0, True, 2.0),
+        (1e-9, True, 2.0),
+        (1.5, True, 0.85 / math.sqrt(1.5)),
+        (4.0, False, 0.4),
+        (1e9, False, 0.2),
+    ):
+        assert step.next_step(0.1, error, 1.0, accepted) == pytest.approx(0.1 * factor)
+
+
 def test_adaptive_steps() -> None:
     """Smaller tolerance: more steps, smaller error; the last step ends at the asked time."""
     fiber = step.shear_fiber(bc.Chain(12, 2.0, modulus=3125.0))

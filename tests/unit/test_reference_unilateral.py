@@ -330,7 +330,11 @@ def test_cluster_in_shear() -> None:
 def test_images_carry_the_flow() -> None:
     """A pair across the sheared face is the pair inside, moved by a box vector."""
     lattice = np.array([[30.0, 0, 4.0], [0, 30.0, 0], [0, 0, 30.0]])
-    inside = rr.make_rods([[0, 0, 14.2], [1, 0.5, 16.3]], [X, Y], 8.0)
+    # The normal is not across the flow, so the image approaches by its own motion as well.
+    normal = np.array([-0.5, 0.0, 1.0]) / math.sqrt(1.25)
+    first = np.array([0.0, 0.0, 14.2])
+    second = first + 2.1 * normal + 0.5 * Y
+    inside = rr.make_rods([first, second], [Y, X + 0.5 * Z], 8.0)
     moved = inside._replace(center=inside.center - np.array([[0, 0, 0], [4.0, 0, 30.0]]))
     near = un.Obstacles(search=1.0)
     plain = un.step_rods(inside, SHEAR, 0.1, near, np.array([[0, 0, 90.0], [0, 0, -90.0]]))
