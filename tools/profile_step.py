@@ -81,17 +81,24 @@ def list_state(method: Any) -> tuple[int, float]:
 
 def print_list(method: Any, count: int, builds: int, seconds: float, steps: int) -> None:
     """Statistics of the neighbor list."""
-    pairs = method.list
+    pairs, report = method.list, method.list_report()
+    kept = max(1, pairs.pair_count)
     acting = int(method.pair_acts.numpy()[: pairs.pair_count].astype(bool).sum())
     rows = {
         "builds": f"{builds} in {steps} steps",
         "per build": f"{seconds / max(builds, 1) / count * 1e9:.0f} ns per segment",
-        "skin": f"{pairs.skin / pairs.reach:.3f} of the reach",
+        "skin": f"{report['skin_diameters']} diameters, mean {report['skin_mean_diameters']}",
         "listed pairs": f"{pairs.pair_count / count:.3f} per segment",
         "acting pairs": f"{acting / count:.3f} per segment",
-        "capacity": f"{pairs.pair_capacity} pairs, {pairs.row_capacity} per row",
+        "capacity": f"{pairs.pair_capacity} pairs",
         "cells": "x".join(map(str, pairs.cells.numpy()[0])),
+        "pieces": f"{pairs.piece_count / count:.2f} per segment",
     }
+    if "compared" in report:
+        rows["candidates"] = (
+            f"{report['in_cells'] / kept:.1f} in cells, {report['compared'] / kept:.1f} compared, "
+            f"{report['confirmed'] / kept:.2f} confirmed per kept pair"
+        )
     print("\n".join(f"{name:14}{text}" for name, text in rows.items()))
 
 

@@ -14,6 +14,7 @@ import pytest
 from tests.cell import Kind, bent_fiber
 from warpfiber.methods.step_launches import native_node_launch, node_launch, plain_node_launch
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN
+from warpfiber.passes.executor import load_kernels
 from warpfiber.passes.native_nodes import fiber_blocks
 from warpfiber.simulation import Simulation
 
@@ -73,7 +74,7 @@ def sweep(sim: Simulation, make: Callable[..., Any]) -> tuple[np.ndarray, np.nda
     arrays = (state.node_pos, state.node_velocity, state.status)
     before = [a.numpy().copy() for a in arrays]
     launch = make(sim.method)
-    launch.load("cpu")
+    load_kernels([launch.kernel], "cpu")
     launch.run("cpu")
     after = [a.numpy().copy() for a in arrays]
     for array, values in zip(arrays, before, strict=True):

@@ -18,7 +18,7 @@ from tests.cell import Array, Kind, bent_fiber, isotropic, straight_fiber
 from warpfiber.methods import bead_chain
 from warpfiber.methods.step_launches import pair_launch
 from warpfiber.model import HALT, PAIR_COUNT
-from warpfiber.passes.executor import Launch
+from warpfiber.passes.executor import Launch, load_kernels
 from warpfiber.passes.native_pairs import BLOCK, native_chunks
 from warpfiber.simulation import Simulation
 
@@ -79,7 +79,7 @@ def launch_of(sim: Simulation, native: bool) -> Launch:
     kept, sim.method.native = sim.method.native, native
     launch = pair_launch(sim.method)
     sim.method.native = kept
-    launch.load("cpu")
+    load_kernels([launch.kernel], "cpu")
     return launch
 
 

@@ -54,6 +54,7 @@ class BeadChain:
         self.dt = dt / model.units.time
         self.workers = self._choose_workers(workers)
         self.native = NATIVE and model.device.startswith("cpu")
+        self.native_nodes = self.native  # where it applies; both are read by `prepare`
         units, contact, domain = model.units, scene.contact, model.domain
         self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
         self.flow_origin = np.zeros(3)
@@ -87,11 +88,11 @@ class BeadChain:
                 longest_rest=longest,
                 stretch=float(self._segment_stretch().max()),
                 workers=self.workers,
+                native=self.native,
             )
             self.skin = self._skin_choice(skin, largest)
             self.check_box()
         self._allocate_pair_results()
-        self.native_nodes = True  # the SIMD node sweep where it applies; read by `prepare`
         self.executor: Executor | None = None
         self._status_view: np.ndarray | None = None
 
