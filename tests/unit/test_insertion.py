@@ -14,6 +14,7 @@ from tests.placed import cube_edge, ends, made_scene, segment_distance
 from warpfiber.placement import overlap_of, place_fibers
 from warpfiber.placement.capsules import Capsules, near_pairs
 from warpfiber.placement.insertion import Crowd
+from warpfiber.placement.packing import SORTED_FROM, space_order
 from warpfiber.placement.space import Cell
 
 
@@ -117,3 +118,27 @@ def test_centers_fill_all_blocks_alike() -> None:
     block = np.floor(4 * middle / edge).astype(int)
     count = np.bincount(block @ [16, 4, 1], minlength=64)
     assert np.sum((count - 2000 / 64) ** 2) / (2000 / 64) < 63 + 5 * np.sqrt(2 * 63)
+
+
+def test_space_order_keeps_neighbors_together() -> None:
+    """64 cells of 4 x 4 x 4: every one, and every block of 8 of them, is a run of the order."""
+    rng = np.random.default_rng(3)
+    center = rng.random((5000, 3)) * 4.0
+    center[0] = 0.0  # cells begin at the lowest point
+    order = space_order(center, 1.0)
+    assert (np.sort(order) == np.arange(len(center))).all()
+    for width, cells in ((1.0, 64), (2.0, 8)):
+        cell = np.floor(center[order] / width).astype(int) @ [1, 10, 100]
+        assert np.count_nonzero(np.diff(cell)) == cells - 1
+
+
+def test_large_groups_are_sorted() -> None:
+    """Neighbors in number are neighbors in space, and every direction stays with its fiber."""
+    group = {"count": SORTED_FROM, "aspect_ratio": 3, "orientation": "isotropic"}
+    edge = cube_edge(SORTED_FROM, 3.0, 0.02)
+    placed = place_fibers(made_scene(group, edge=edge, segments=1))
+    a, b = ends(placed)
+    middle = 0.5 * (a + b)
+    near = np.median(np.linalg.norm(np.diff(middle, axis=0), axis=1))
+    assert near < 0.1 * edge  # 0.66 of the edge in random order
+    assert placed.report["overlap"]["pairs"] == 0

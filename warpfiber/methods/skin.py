@@ -16,7 +16,7 @@ import numpy as np
 
 # ns, one core, float64, 20,000 segments; only ratios matter.
 BUILD_PIECE, BUILD_NEAR = 140.0, 100.0  # of a piece; of what it finds around it at the first skin
-PAIR_COST = 15.0  # of one more listed pair in a step
+PAIR_COST = 10.0  # of one more listed pair in a step, gathered too
 START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one

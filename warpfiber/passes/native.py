@@ -6,6 +6,7 @@ lane per item, no intrinsics. Every block repeats laws that stay in Warp and is 
 
 from warpfiber.model import precision
 
+PREFETCH_NODES = 100_000  # from so many nodes on they do not stay in a cache
 LANES = {"float32": 16, "float64": 8}  # 64 bytes
 
 

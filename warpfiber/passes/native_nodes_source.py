@@ -12,7 +12,7 @@ import math
 from warpfiber.laws.bending import SMALLEST_SINE, bending_series
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN
-from warpfiber.passes.native import LANES, lane_types, transpose
+from warpfiber.passes.native import LANES, PREFETCH_NODES, lane_types, transpose
 from warpfiber.passes.nodes import TEAR_STRETCH, NodeFeatures
 
 # Terms of the bending series up to a right angle, multiples of four: errors 2e-17 and 3e-10.
@@ -41,6 +41,7 @@ def _constants(name: str, features: NodeFeatures) -> str:
     terms = SERIES_TERMS[name]
     series = ", ".join(f"T({value!r})" for value in bending_series(1.0, terms))
     lines.append(f"constexpr int TERMS = {terms};")
+    lines.append(f"constexpr int PREFETCH_NODES = {PREFETCH_NODES};")
     lines.append(f"constexpr T SERIES[TERMS] = {{{series}}};")
     slots = {
         "SLOT_EXPIRED": EXPIRED,
@@ -302,6 +303,42 @@ _STEP = """
     store((T*)node_velocity, v, keep);
 """
 
+# Fibers that a cache does not hold are asked for one block ahead: rows of many fibers at once are
+# more streams than the processor follows by itself.
+_PREFETCH = """
+    if (node_count > PREFETCH_NODES && block + 1 < block_count) {
+        const int* ahead = fiber + W;
+        for (int l = 0; l < W; ++l) {
+            const long begin = 3L * fiber_node_start[ahead[l]];
+            const long end = 3L * fiber_node_start[ahead[l] + 1];
+            constexpr int line = 64 / sizeof(T);
+            for (long at = begin; at < end + line; at += line) {
+                __builtin_prefetch((const T*)node_pos + at, 1);
+                __builtin_prefetch((const T*)node_velocity + at, 1);
+                if constexpr (HAS_PAIRS) __builtin_prefetch((const T*)list_pos + at);
+            }
+            if constexpr (HAS_PAIRS) {
+                const int segment = fiber_node_start[ahead[l]] - ahead[l];
+                const int segment_end = fiber_node_start[ahead[l] + 1] - ahead[l] - 1;
+                const int out_end = out_start[segment_end];
+                for (int k = out_start[segment]; k < out_end; ++k)
+                    if (pair_acts[k]) {
+                        __builtin_prefetch((const T*)pair_force + 3 * (long)k);
+                        __builtin_prefetch((const T*)pair_closest + 2 * (long)k);
+                    }
+                const int in_end = in_start[segment_end];
+                for (int slot = in_start[segment]; slot < in_end; ++slot) {
+                    const int k = in_pair[slot];
+                    if (pair_acts[k]) {
+                        __builtin_prefetch((const T*)pair_force + 3 * (long)k);
+                        __builtin_prefetch((const T*)pair_closest + 2 * (long)k);
+                    }
+                }
+            }
+        }
+    }
+"""
+
 _SWEEP = (
     """
     const int* fiber = block_fiber + W * block;
@@ -312,6 +349,9 @@ _SWEEP = (
     const unsigned all = (1u << own) - 1u;  // a bit per lane with a fiber of its own
     int first[W];
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
+"""
+    + _PREFETCH
+    + """
     const int room = size < W ? W : size;  // a square always fits
     V* x = (V*)__builtin_alloca_with_align(4 * room * sizeof(V), 8 * sizeof(V));
     V* v = x + room;
@@ -342,7 +382,7 @@ def node_sweep_source(name: str, features: NodeFeatures, arrays: list[str]) -> s
     """
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
-    const int node_count = node_pos.shape[0];
+    const int node_count = node_pos.shape[0], block_count = block_own.shape[0];
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name)}

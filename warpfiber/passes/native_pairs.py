@@ -18,6 +18,7 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import HALT, PAIR_COUNT, precision
+from warpfiber.passes.native import PREFETCH_NODES
 from warpfiber.passes.native_beads import squeeze_text
 from warpfiber.passes.pairs import (
     IMAGE_BITS,
@@ -100,6 +101,17 @@ NEAR_PAIRS = Template("""
         b = transpose(rows_b);
         delta = transpose(rows_delta);
     };
+    if (node_pos.shape[0] > $prefetch_nodes) {
+        // what a cache does not hold is asked for two blocks ahead, its addresses four ahead
+        const int capacity = pair_j.shape[0];
+        for (int k = first + 2 * 64; k < first + 3 * 64 && k < capacity; ++k) {
+            const real* j = nodes + 3 * (long long)segment[pair_j.data[k]];
+            __builtin_prefetch(j);
+            __builtin_prefetch(j + 5);
+            __builtin_prefetch((real*)pair_force.data + 3 * (long long)k, 1);
+            if (k + 2 * 64 < capacity) __builtin_prefetch(segment + pair_j.data[k + 2 * 64]);
+        }
+    }
     unsigned long long near = 0, touch = 0;
     for (int group = 0; group < count; group += $lanes) {
         int ks[$lanes];
@@ -160,6 +172,7 @@ def make_pair_block(name: str, features: PairFeatures):
         mask=(1 << IMAGE_BITS) - 1,
         half=1 << (IMAGE_BITS - 1),
         shift=SHIFT if features.periodic else "",
+        prefetch_nodes=PREFETCH_NODES,
         tiny="1.0e-30",
         eps=p.eps,
         rest=rest,
