@@ -23,10 +23,12 @@ from warpfiber.scene.derived import (
     total_strain,
 )
 
-# Measured on cells of the shipped scenes: listed pairs per segment stay below the capacity of 4.
-_BYTES_PER_PAIR = 4 * 7 + 8 * 11
-_BYTES_PER_SEGMENT = 4 * 3 * 24 + 120
-_BYTES_PER_NODE = 8 * 3 * 4
+# Counted in the arrays of shipped scenes on the CPU: integers, and reals of the larger precision.
+_BYTES_PER_NODE = 96
+_BYTES_PER_SEGMENT, _REAL_BYTES_PER_SEGMENT = 90, 48
+_PAIRS_PER_SEGMENT = 1.5  # first capacity; lists of denser cells grow
+_BYTES_PER_PAIR = 33
+_REAL_BYTES_PER_PAIR = {True: 72, False: 40}  # with and without lubrication
 
 
 def _number(value: float | None, unit: str = "") -> str:
@@ -40,7 +42,9 @@ def memory_bytes(scene: Scene) -> float:
     segments = sum(segment_count(group) for group in scene.fibers)
     size = nodes * _BYTES_PER_NODE * real
     if contact_reach(scene) > 0.0:
-        size += segments * (_BYTES_PER_SEGMENT + 4 * _BYTES_PER_PAIR * real)
+        pair = _BYTES_PER_PAIR + real * _REAL_BYTES_PER_PAIR[scene.contact.lubrication != "none"]
+        size += segments * (_BYTES_PER_SEGMENT + real * _REAL_BYTES_PER_SEGMENT)
+        size += segments * _PAIRS_PER_SEGMENT * pair
     return size
 
 
