@@ -4,15 +4,18 @@
 
 Bytes: every array that a kernel reads or writes, once each, pair arrays up to the pairs in use: the
 least that must move. They are compared with a copy of as many bytes by one core (CPU only), so that
-a pass far below that bandwidth is bound by arithmetic or latency, not by memory.
+a pass far below that bandwidth is bound by arithmetic or latency, not by memory. Overhead: whole
+steps less their passes, timed apart; its noise is that of both.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import warp as wp
 from machine import commit, copy_bandwidth, processor
 
@@ -46,32 +49,44 @@ def profile(args: argparse.Namespace) -> None:
     simulation.step(args.warm)
     builds_before, seconds_before = list_state(method)
     times = simulation.pass_times(args.steps)
-    simulation.step(args.steps)
-    steps = 2 * args.steps
+    stepping = float(np.median([step_time(simulation, args.steps // 16) for _ in range(16)]))
+    steps = args.steps + args.steps // 16 * 16
     builds, seconds = list_state(method)
     builds, seconds = builds - builds_before, seconds - seconds_before
     rows = [(launch.name, times[launch.name], launch) for launch in method.executor.launches]
-    whole = sum(times.values()) + seconds / steps
+    overhead = stepping - sum(times.values())
+    whole = stepping + seconds / steps
     print(f"{scene.name}: {simulation.model.fiber_count} fibers, {count} segments, ", end="")
     print(f"{scene.numerics.precision}, {simulation.device}, 1 worker")
     print(f"{processor()}, warpfiber {commit()}")
     print(f"{'pass':10}{'us/step':>10}{'ns/seg':>9}{'share':>8}{'B/seg':>8}{'GB/s':>8}{'copy':>8}")
     on_cpu = simulation.device.startswith("cpu")
-    for name, time, launch in rows:
+
+    def line(name: str, per_step: float) -> str:
+        return (
+            f"{name:10}{per_step * 1e6:10.1f}{per_step / count * 1e9:9.1f}{per_step / whole:8.1%}"
+        )
+
+    for name, per_step, launch in rows:
         moved = bytes_moved(launch, method.list)
         limit = copy_bandwidth(moved // 2) / 1e9 if on_cpu else float("nan")
-        rate = moved / time / 1e9 if time > 0.0 else float("nan")
-        print(
-            f"{name:10}{time * 1e6:10.1f}{time / count * 1e9:9.1f}{time / whole:8.1%}"
-            f"{moved / count:8.0f}{rate:8.1f}{limit:8.1f}"
-        )
+        rate = moved / per_step / 1e9 if per_step > 0.0 else float("nan")
+        print(line(name, per_step) + f"{moved / count:8.0f}{rate:8.1f}{limit:8.1f}")
     if method.list is not None:
-        time = seconds / steps
-        print(f"{'list':10}{time * 1e6:10.1f}{time / count * 1e9:9.1f}{time / whole:8.1%}")
-    print(f"{'sum':10}{whole * 1e6:10.1f}{whole / count * 1e9:9.1f}")
+        print(line("list", seconds / steps))
+    print(line("overhead", overhead))
+    print(line("step", whole))
     if method.list is not None:
         print_list(method, count, builds, seconds, steps)
     simulation.close()
+
+
+def step_time(simulation: wf.Simulation, steps: int) -> float:
+    """Seconds per step, list builds apart."""
+    begin, listing = time.perf_counter(), simulation.method.list_seconds
+    simulation.step(steps)
+    listing = simulation.method.list_seconds - listing
+    return (time.perf_counter() - begin - listing) / steps
 
 
 def list_state(method: Any) -> tuple[int, float]:
@@ -108,7 +123,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("--set", action="append", default=[], type=parse_override)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--steps", type=int, default=512)
     parser.add_argument("--warm", type=int, default=200)
     profile(parser.parse_args())
 
