@@ -64,7 +64,7 @@ def check_step(scene: Scene) -> tuple[float, list[StepLimit]]:
         raise SceneError([Fault(scene.path, "numerics.dt", "auto", remedy)])
     if dt > smallest.dt and not scene.numerics.allow_unstable_dt:
         remedy = (
-            f"above the stable limit {smallest.dt:.4g} s set by {smallest.term}; take "
+            f"above what is {smallest.kind}, {smallest.dt:.4g} s, set by {smallest.term}; take "
             'dt = "auto" or a smaller one, or set numerics.allow_unstable_dt = true'
         )
         raise SceneError([Fault(scene.path, "numerics.dt", dt, remedy)])
