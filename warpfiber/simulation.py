@@ -289,6 +289,7 @@ class Simulation:
             # the list of the snapshot was built from other positions: build the same one again
             self.method.set_stretch(float(arrays["stretch_allowed"]))
             self.method.set_skin(float(arrays["skin"][0]))
+            self.method.skin.begun = self.step_count
             state.node_pos.assign(arrays["list_pos"])
             state.lattice.assign(arrays["list_lattice"])
             self.method.refresh_list(wrap=False)
