@@ -50,6 +50,7 @@ def profile(args: argparse.Namespace) -> None:
     builds_before, seconds_before = list_state(method)
     times = simulation.pass_times(args.steps)
     stepping = float(np.median([step_time(simulation, args.steps // 16) for _ in range(16)]))
+    simulation.prepare()  # a list that grew has left no launches
     steps = args.steps + args.steps // 16 * 16
     builds, seconds = list_state(method)
     builds, seconds = builds - builds_before, seconds - seconds_before

@@ -120,7 +120,7 @@ class Job:
     def describe(self) -> str:
         """One line: counts, dt and what limits it."""
         model, limit = self.simulation.model, self.simulation.limits[0]
-        warning = "unstable: above its " if self.simulation.dt > limit.dt else ""
+        warning = f"not {limit.kind}: above its " if self.simulation.dt > limit.dt else ""
         return (
             f"{model.fiber_count} fibers, {model.segment_count} segments, "
             f"dt {self.simulation.dt:.4g} s ({warning}limit {limit.dt:.4g} s, {limit.term}), "

@@ -64,7 +64,7 @@ def check_step(scene: Scene) -> tuple[float, list[StepLimit]]:
         raise SceneError([Fault(scene.path, "numerics.dt", "auto", remedy)])
     if dt > smallest.dt and not scene.numerics.allow_unstable_dt:
         remedy = (
-            f"above the stable limit {smallest.dt:.4g} s set by {smallest.term}; take "
+            f"above what is {smallest.kind}, {smallest.dt:.4g} s, set by {smallest.term}; take "
             'dt = "auto" or a smaller one, or set numerics.allow_unstable_dt = true'
         )
         raise SceneError([Fault(scene.path, "numerics.dt", dt, remedy)])
@@ -289,6 +289,7 @@ class Simulation:
             # the list of the snapshot was built from other positions: build the same one again
             self.method.set_stretch(float(arrays["stretch_allowed"]))
             self.method.set_skin(float(arrays["skin"][0]))
+            self.method.skin.begun = self.step_count
             state.node_pos.assign(arrays["list_pos"])
             state.lattice.assign(arrays["list_lattice"])
             self.method.refresh_list(wrap=False)

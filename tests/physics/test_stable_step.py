@@ -83,6 +83,19 @@ def test_refused_above_the_limit(start: Start) -> None:
     assert "numerics.dt" in text and "stretching" in text and "allow_unstable_dt" in text
 
 
+def test_refused_by_the_flow(start: Start) -> None:
+    """A step of more than 0.02 strain would be stable here: the fault says that it is accuracy."""
+    heavy = Kind(2, 2.0, density=10.0, modulus=1.0)
+    nodes = straight_fiber(heavy, (1, 0, 0), (0, 0, 0))
+    flow = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
+    sim = start([heavy], [nodes], flow=flow, numerics={"dt": 0.02})
+    assert [limit.kind for limit in sim.limits] == ["accurate", "stable", "stable"]
+    with pytest.raises(SceneError) as caught:
+        start([heavy], [nodes], flow=flow, numerics={"dt": 0.021})
+    assert "accurate, 0.02 s, set by flow" in str(caught.value)
+    assert "stable," not in str(caught.value)
+
+
 def test_divergence_names_fiber_term_and_limit(start: Start) -> None:
     """With the flag the run goes on until a fiber tears; the state stays that before the tear."""
     slack = Kind(12, 2.0, modulus=30.0)

@@ -172,6 +172,56 @@ def test_measure_after_restore(start: Start) -> None:
     assert run.measure() == again.measure()
 
 
+def test_restore_after_fibers_spread(start: Start) -> None:
+    """Without a box a continued run begins with fibers elsewhere; long segments are cut alike."""
+    kinds = (Kind(1, 40.0, modulus=2000.0), Kind(1, 1.0, modulus=2000.0))
+    which = [0] * 6 + [1] * 300
+    rng = np.random.default_rng(5)
+    fibers = [bent_fiber(kinds[k], rng, 60.0 * rng.random(3)) for k in which]
+    far = [nodes + 3.0 * nodes.mean(axis=0) for nodes in fibers]
+    contact = {"law": "exponential", "strength": 1.0, "decay": 2.0}
+    numerics = {"dt": 4e-3}
+    run, again = (
+        start(kinds, some, which, flow=SHEAR, contact=contact, numerics=numerics)
+        for some in (fibers, far)
+    )
+    assert run.method.list.piece_count > run.model.segment_count
+    assert run.method.list.piece_count == again.method.list.piece_count
+    run.step(20)
+    again.restore(run.snapshot())
+    for sim in (run, again):
+        sim.step(100)
+    assert_same(run, again)
+
+
+def test_restore_keeps_what_the_box_bears(start: Start) -> None:
+    """A box that was looked at with a thin skin ends at the same strain when restored."""
+    rod = Kind(2, 4.0, modulus=2000.0)
+
+    def begin() -> Simulation:
+        rng = np.random.default_rng(3)
+        fibers = [bent_fiber(rod, rng, 8.0 + 10.0 * rng.random(3)) for _ in range(4)]
+        return start(
+            [rod],
+            fibers,
+            flow={"kind": "planar_extension", "extension_rate": 1.0, "viscosity": 1.0},
+            box={"size": [26.0] * 3},
+            contact={"law": "exponential", "strength": 1.0, "decay": 2.0},
+        )
+
+    run = begin()
+    run.step(1)
+    thin, pairs = run.method.skin.least, run.method.list
+    run.method.set_skin(thin)
+    run.method.set_stretch(1.2 * pairs.stretch_allowed)
+    run.method.refresh_list()
+    again = begin()
+    again.restore(run.snapshot())
+    assert again.method.list.skin == pairs.skin == thin
+    assert again.method.strain_end == run.method.strain_end
+    assert_same(run, again)
+
+
 def test_restore_of_stretched_fibers(start: Start) -> None:
     """Soft fibers outgrow the cells of the list; the restored run must rebuild when the run did."""
     soft = Kind(3, 3.0, modulus=60.0)

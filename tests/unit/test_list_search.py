@@ -14,6 +14,7 @@ from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, RATIO
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pieces import piece_counts
 from warpfiber.scene import SceneError
+from warpfiber.simulation import Simulation
 
 LONG, SHORT, TWICE = Kind(1, 50.0), Kind(1, 1.0), Kind(2, 50.0)
 BOXES = {
@@ -173,3 +174,29 @@ def test_skin_follows_the_motion(start: Start) -> None:
     height = 13.0 / np.sqrt(1.25)
     assert tight.method.list.cell_width <= height
     assert tight.method.skin.largest < 4.0
+
+
+def test_report_of_builds_and_skins(start: Start) -> None:
+    """Mean skin over the steps taken, steps per build; a continued run counts its own steps."""
+    kind = Kind(2, 4.0, modulus=3000.0)
+    fibers, _ = random_fibers((kind,), 60, [34.0] * 3, seed=44, spread=5.0)
+
+    def begin() -> Simulation:
+        box = {"size": [34.0] * 3}
+        return cell(start, (kind,), fibers, flow=SHEAR, box=box, numerics={"dt": 4e-3})
+
+    run, skins = begin(), []
+    for _ in range(120):
+        skins.append(run.method.list.skin)  # of the list that this step uses
+        run.step()
+    assert len(set(skins)) > 1
+    report, diameter = run.method.list_report(), 2.0
+    assert report["skin_mean_diameters"] == pytest.approx(np.mean(skins) / diameter, abs=1e-4)
+    assert report["steps_per_build"] == round(120 / run.method.list.build_count, 2)
+    again = begin()
+    built = again.method.list.build_count
+    again.restore(run.snapshot())
+    again.step(60)
+    builds = again.method.list.build_count
+    assert builds > built + 1
+    assert again.method.list_report()["steps_per_build"] == round(60 / builds, 2)

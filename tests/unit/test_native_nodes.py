@@ -14,8 +14,9 @@ import pytest
 from tests.cell import Kind, bent_fiber
 from warpfiber.methods.step_launches import native_node_launch, node_launch, plain_node_launch
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN
+from warpfiber.passes import native_nodes_source
 from warpfiber.passes.executor import load_kernels
-from warpfiber.passes.native_nodes import fiber_blocks
+from warpfiber.passes.native_nodes import fiber_blocks, make_native_node_sweep
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
@@ -198,6 +199,22 @@ def test_one_worker_or_two(start: Start) -> None:
         sim.step(5)
         states.append(np.concatenate([sim.node_pos, sim.node_velocity]))
     np.testing.assert_array_equal(*states)
+
+
+@pytest.mark.parametrize("name", ["alone", "pairs", "arms"])
+def test_asking_ahead(start: Start, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """What only large cells do, in a small one: the same bits."""
+    sim = crowd(start, "float64", "consistent", SCENES[name])
+    sim.step(2)
+    expected = sweep(sim, native_node_launch)
+    monkeypatch.setattr(native_nodes_source, "PREFETCH_NODES", 0)
+    make_native_node_sweep.cache_clear()
+    try:
+        found = sweep(sim, native_node_launch)
+    finally:
+        make_native_node_sweep.cache_clear()
+    for got, want in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(got, want)
 
 
 def test_where_it_applies(start: Start) -> None:

@@ -151,8 +151,13 @@ class BeadChain:
 
     @property
     def box_width(self) -> float:
-        """Smallest height that a periodic box may have, run units."""
-        return self.list.cell_width if self.list is not None else 0.0
+        """Smallest height that a periodic box may have, run units.
+
+        With the start skin: a run and its continuation have chosen others when they ask.
+        """
+        if self.list is None or self.skin is None:
+            return 0.0
+        return self.list.cell_width - self.list.skin + self.skin.start
 
     def set_gradient(self) -> None:
         """The flow's gradient at the present strain, before the first step sets it."""

@@ -43,9 +43,10 @@ class SkinChoice:
     use: float = 0.0  # skin per step; 0 as long as nothing is known
     built_step: int = 0
     # for the report: the mean over steps and what made it
+    begun: int = 0  # earlier steps are those of another process
+    listed: float = 0.0  # skin of the present list
     steps: int = 0
     skin_steps: float = 0.0
-    changes: int = 0
 
     def volume(self, distance: float) -> float:
         """Where midpoints of segments nearer than `distance` lie, mean over orientations."""
@@ -54,13 +55,13 @@ class SkinChoice:
 
     def built(self, step: int) -> None:
         """A list was built at this step."""
-        self._count(step)
-        self.built_step = step
-
-    def _count(self, step: int) -> None:
-        taken = max(0, step - self.built_step)
+        taken = self._steps_since(step)
         self.steps += taken
-        self.skin_steps += taken * self.skin
+        self.skin_steps += taken * self.listed
+        self.built_step, self.listed = step, self.skin
+
+    def _steps_since(self, step: int) -> int:
+        return max(0, step - max(self.built_step, self.begun))
 
     def choose(self, step: int, pairs_per_segment: float) -> float:
         """The skin of the next build, after the present one was used up at `step`."""
@@ -94,18 +95,17 @@ class SkinChoice:
 
     def set_skin(self, skin: float) -> None:
         """Another skin."""
-        self.changes += skin != self.skin
         self.skin = skin
 
     def mean(self, step: int) -> float:
         """Mean skin over the steps so far."""
         steps = self.steps_counted(step)
-        now = steps - self.steps
-        return (self.skin_steps + now * self.skin) / steps if steps else self.skin
+        now = self._steps_since(step)
+        return (self.skin_steps + now * self.listed) / steps if steps else self.skin
 
     def steps_counted(self, step: int) -> int:
         """Steps since this choice began, in this process."""
-        return self.steps + max(0, step - self.built_step)
+        return self.steps + self._steps_since(step)
 
     def saved(self) -> np.ndarray:
         """What a continued run needs to choose the same."""

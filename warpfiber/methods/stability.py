@@ -1,4 +1,4 @@
-"""Largest stable step of the explicit bead chain, term by term.
+"""Largest step of the explicit bead chain, term by term: stable, and accurate in the flow.
 
 Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
     max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
@@ -26,15 +26,21 @@ Matrix = np.ndarray
 CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
 FLOW_STRAIN = 0.02  # largest strain of a step
+FLOW_TERM = "flow"
 
 
 @dataclass(frozen=True)
 class StepLimit:
-    """One term's largest stable step in s."""
+    """One term's largest step in s."""
 
     term: str
     dt: float
     group: int
+
+    @property
+    def kind(self) -> str:
+        """What a step up to it is: `stable`, or `accurate` where the flow decides."""
+        return "accurate" if self.term == FLOW_TERM else "stable"
 
 
 def stable_limit(stiffness: Matrix, damping: Matrix, mass: Matrix, drag: Matrix) -> float:
@@ -135,7 +141,7 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
         factors = [abs(factor) for _, factor in scene.flow.schedule or ((0.0, 1.0),)]
         rate = np.abs(scene.flow.velocity_gradient).max() * max(factors)
         if rate > 0.0:
-            limits.append(StepLimit("flow", FLOW_STRAIN / rate, index))
+            limits.append(StepLimit(FLOW_TERM, FLOW_STRAIN / rate, index))
     contact = scene.contact
     if contact.strength:  # walls push by it even without pairs
         steepness = contact.decay / (2.0 * a)

@@ -29,7 +29,6 @@ def lane_types(name: str) -> str:
             return {{y * b.z - z * b.y, z * b.x - x * b.z, x * b.y - y * b.x}};
         }}
     }};
-    auto lanes_of = [](T s) -> V {{ return V(s); }};
     auto same3 = [](T x, T y, T z) -> V3 {{ return V3{{V(x), V(y), V(z)}}; }};
     auto any = [](M m) -> bool {{ return __builtin_reduce_or(m) != 0; }};
 """

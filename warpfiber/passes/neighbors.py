@@ -43,6 +43,7 @@ from warpfiber.passes.rows import make_row_kernels
 
 FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
 CELL_SLACK = 1.02  # what a segment may grow in the step that outgrows the cells
+OPEN_FRACTION = 0.1  # volume fraction that long segments are cut for where there is no box
 
 
 class NeighborList:
@@ -101,6 +102,10 @@ class NeighborList:
         numbers = np.bincount(mine, minlength=len(model.group_rows))
         rest = [row["rest"] for row in model.group_rows]
         volume = float(np.prod(model.domain.size))
+        if not any(model.domain.periodic + model.domain.wall):
+            # where fibers may spread, the room they take now says nothing of a continued run
+            sizes = [math.pi * row["radius"] ** 2 * row["rest"] for row in model.group_rows]
+            volume = float(numbers @ sizes) / OPEN_FRACTION
         counts = piece_counts(rest, numbers.tolist(), self.reach + self.skin, volume)
         self.longest_piece = max(r / c for r, c in zip(rest, counts, strict=True))
         each = np.asarray(counts)[mine]

@@ -55,20 +55,12 @@ NO_IMAGE = image_code(0, 0, 0)
 
 @cache
 def make_image(name: str):
-    """Device versions of `image_code` and its inverse."""
+    """Device version of the inverse of `image_code`: three image numbers of a code."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     half = 1 << (IMAGE_BITS - 1)
     mask = (1 << IMAGE_BITS) - 1
     bits = IMAGE_BITS
-
-    @wp.func
-    def pack_image(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
-        return (
-            (x + wp.static(half))
-            | ((y + wp.static(half)) << wp.static(bits))
-            | ((z + wp.static(half)) << wp.static(2 * bits))
-        )
 
     @wp.func
     def unpack_image(code: wp.int32) -> vec3:
@@ -77,7 +69,7 @@ def make_image(name: str):
         z = ((code >> wp.static(2 * bits)) & wp.static(mask)) - wp.static(half)
         return vec3(real(x), real(y), real(z))
 
-    return pack_image, unpack_image
+    return unpack_image
 
 
 @cache
@@ -86,7 +78,7 @@ def make_pair_geometry(name: str, features: PairFeatures):
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     closest_fractions = make_segment_distance(name)
-    _, unpack_image = make_image(name)
+    unpack_image = make_image(name)
     lubricate = make_bead_pairs(name, features.lubrication == "shifted")
     zero, one = real(0.0), real(1.0)
     periodic = features.periodic

@@ -2,8 +2,8 @@
 
 Cost of a search, in the time of one candidate: every piece meets the midpoints within the reach and
 half the longest piece of it, and has a cost of its own. Halving a long segment doubles its pieces
-but lets all cells be narrower. The counts depend on the lengths at rest alone, so a run and its
-continuation cut alike.
+but lets all cells be narrower. The counts depend on lengths at rest and on the box, not on
+where the segments are, so a run and its continuation cut alike.
 """
 
 from __future__ import annotations

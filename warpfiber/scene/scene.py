@@ -94,7 +94,7 @@ class Numerics:
     strain_step: float | None = None
     tolerance: float | None = None
     dt_fraction: float
-    """of the stable limit, where dt is auto"""
+    """of the smallest limit, where dt is auto"""
     allow_unstable_dt: bool
     precision: str
     """float32, float64"""
