@@ -12,7 +12,9 @@ import pytest
 from tests.cell import Kind, isotropic, straight_fiber
 from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
 from tests.reference import segments as sg
+from warpfiber.model import BAD_FIBER, TORN
 from warpfiber.passes.neighbors import NeighborList
+from warpfiber.simulation import Diverged
 
 PERIODIC = ["periodic"] * 3
 
@@ -244,3 +246,34 @@ def test_contact_count(
     pairs = 0.5 * expected * count
     assert abs(row["contacts_per_fiber"] - expected) < 4.0 * expected / np.sqrt(pairs)
     assert row["coordination_number"] == row["contacts_per_fiber"]  # one segment per fiber
+
+
+@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("thrown", [1e12, 1e79])
+def test_a_thrown_fiber_grows_no_list(start: Start, native: bool, thrown: float) -> None:
+    """A diverging step may throw a whole fiber: the run stops and names it, capacities stay."""
+    fibers, which = random_fibers(MIXED, 90, [40.0] * 3, seed=2)
+    sim = cell(start, MIXED, fibers, which, box={"size": [40.0] * 3})
+    pairs = sim.method.list
+    assert pairs is not None
+    tight = NeighborList(
+        sim.model,
+        sim.state,
+        reach=pairs.reach,
+        skin=pairs.skin,
+        longest_rest=pairs.longest_rest,
+        row_capacity=1,
+        pair_capacity=1,
+        native=native,
+    )
+    nodes = sim.state.node_pos.numpy().copy()
+    mine = slice(*sim.fiber_node_start[7:9])
+    nodes[mine] += thrown
+    sim.state.node_pos.assign(nodes)
+    tight.build()
+    status = sim.state.status.numpy()
+    assert status[TORN] == 1 and status[BAD_FIBER] == 7
+    assert tight.pair_capacity == 1 and tight.grow_count == 0
+    with pytest.raises(Diverged, match="fiber 7"):
+        sim.step(1)
+    tight.close()

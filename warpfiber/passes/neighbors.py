@@ -19,11 +19,13 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import (
+    BAD_FIBER,
     OVERFLOW,
     OVERFLOW_PAIRS,
     OVERFLOW_ROW,
     PAIR_COUNT,
     ROW_NEED,
+    TORN,
     Model,
     State,
 )
@@ -38,10 +40,12 @@ from warpfiber.passes.executor import Executor
 from warpfiber.passes.list_launches import list_launches
 from warpfiber.passes.native_search import make_search_kernels
 from warpfiber.passes.native_sort import make_sort_kernels
+from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pieces import piece_counts
 from warpfiber.passes.rows import make_row_kernels
 
 FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
+FARTHEST = 1e8  # lengths from the origin, where single precision no longer tells neighbors
 CELL_SLACK = 1.02  # what a segment may grow in the step that outgrows the cells
 OPEN_FRACTION = 0.1  # volume fraction that long segments are cut for where there is no box
 
@@ -252,6 +256,12 @@ class NeighborList:
             if overflow == 0:
                 self.build_count += 1
                 return replaced
+            lost = self._lost_fiber()
+            if lost is not None:
+                words = status.copy()
+                words[TORN], words[BAD_FIBER], words[OVERFLOW] = 1, lost, 0
+                self.state.status.assign(words)
+                return replaced
             self.grow_count += 1
             wrap = False  # fibers are inside the box by now
             need = int(status[ROW_NEED])
@@ -264,6 +274,19 @@ class NeighborList:
                 self.pair_capacity = int(1.3 * max(int(status[PAIR_COUNT]), need)) + 64
                 self._allocate_pairs()
                 replaced = True
+
+    def _lost_fiber(self) -> int | None:
+        """A fiber that the last step tore or threw so far that no list can hold it."""
+        model = self.model
+        nodes = self.state.node_pos.numpy().astype(float)
+        first = model.host["segment_node"]
+        rest = np.asarray([row["rest"] for row in model.group_rows])
+        rest = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1)
+            far = np.abs(nodes[first]).max(axis=1) > FARTHEST * (self.longest_rest + self.reach)
+            lost = np.flatnonzero(~(length < TEAR_STRETCH * rest) | far)
+        return int(model.host["segment_fiber"][lost[0]]) if len(lost) else None
 
 
 def _never() -> bool:
