@@ -54,12 +54,14 @@ def _group_row(scene: Scene, group: FiberGroup, units: Units) -> dict[str, Any]:
         weight = bead * (density - scene.gravity.fluid_density)
         gravity = weight * np.asarray(scene.gravity.acceleration) / units.force
     reduced = m - 1.0
+    stretching = math.pi * a * (group.axial_modulus / stress) / (2.0 * m)
     inner = max(1, round(reduced)) if reduced > 1e-9 else 0
     return {
         "radius": a,
         "rest": 2.0 * a * m,
         "spacing": m,
-        "stretching": math.pi * a * (group.axial_modulus / stress) / (2.0 * m),
+        "stretching": stretching,
+        "compliance": 0.0 if group.inextensible else 1.0 / stretching,
         "bending": math.pi * a**3 * (group.bending_modulus / stress) / (8.0 * m),
         "mass": bead * density / units.mass,
         "drag": 6.0 * math.pi * eta * a,
