@@ -1,4 +1,4 @@
-"""Largest stable step of the explicit bead chain, term by term.
+"""Largest stable step of the explicit bead chain, term by term, and the step that a scene takes.
 
 Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
     max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
+from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
 
 Matrix = np.ndarray
@@ -107,7 +108,7 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
-    mass = 4.0 / 3.0 * math.pi * a**3 * group.density
+    mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)
     zeta = 6.0 * math.pi * eta * a
     axial, bending, torque, galerkin = _matrices(group, eta, scene.numerics.torque_weights)
     n = group.segments
@@ -150,7 +151,10 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
 
 
 def step_limits(scene: Scene) -> list[StepLimit]:
-    """All limits of all groups, smallest first."""
+    """All limits of all groups, smallest first; `overdamped` has none but the strain of a step."""
+    if scene.numerics.method == "overdamped":
+        dt = largest_step(scene)
+        return [StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0)]
     limits = [limit for i in range(len(scene.fibers)) for limit in _group_limits(scene, i)]
     return sorted(limits, key=lambda limit: limit.dt)
 
@@ -158,6 +162,8 @@ def step_limits(scene: Scene) -> list[StepLimit]:
 def chosen_step(scene: Scene) -> float:
     """dt in s: given (or from the strain step), or `dt_fraction` of the smallest limit."""
     numerics = scene.numerics
+    if numerics.method == "overdamped":
+        return strain_step(scene)
     if numerics.dt is not None:
         return numerics.dt
     return numerics.dt_fraction * step_limits(scene)[0].dt
