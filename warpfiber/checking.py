@@ -6,8 +6,8 @@ import math
 
 from warpfiber.methods.bead_chain import contact_reach
 from warpfiber.methods.box_limits import bearable_strain
-from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.overdamped import overdamped_bytes
+from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import chosen_step, step_limits
 from warpfiber.methods.strain_steps import LARGEST_STRAIN
 from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
@@ -105,7 +105,11 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
     if numerics.method == "overdamped":
         rows.append(("dt limit", "none: stable at any step"))
-        share = f"strain {dt / limits[0].dt * LARGEST_STRAIN:.3g}" if math.isfinite(limits[0].dt) else ""
+        share = (
+            f"strain {dt / limits[0].dt * LARGEST_STRAIN:.3g}"
+            if math.isfinite(limits[0].dt)
+            else ""
+        )
         if numerics.tolerance is not None:
             rows.append(("tolerance, lengths of a fiber", _number(numerics.tolerance)))
             rows.append(("largest dt", f"{dt:.4g} s = {share}"))

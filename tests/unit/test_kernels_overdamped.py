@@ -156,7 +156,11 @@ def test_compression_within_a_step(start: Start) -> None:
     kind = Kind(6, 2.0, modulus=100.0)
     x = bent_fiber(kind, np.random.default_rng(6), spread=0.1, stretch=0.0)
     sim = overdamped(
-        start, [kind], [x], groups={"bending_modulus": 0.0}, numerics={"integrator": "bdf2", "dt": 0.2}
+        start,
+        [kind],
+        [x],
+        groups={"bending_modulus": 0.0},
+        numerics={"integrator": "bdf2", "dt": 0.2},
     )
     sim.state.step.assign([1])
     push = np.full(kind.segments, -500.0)

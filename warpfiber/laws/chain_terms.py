@@ -1,8 +1,8 @@
 """Entries of the matrices of one fiber without inertia: drag of its beads, bending of its joints.
 
 Source: bead drag projected on hat functions, zeta A with A of `closure` (Galerkin); bending energy
-    k_b / (2 l^2) sum |x_(i+1) - 2 x_i + x_(i-1)|^2, whose matrix is k_b / l^2 D^T D, rows (1, -2, 1)
-    of D; turning of a segment is resisted by tau = 8 pi eta a^3 w / d^2 and by the tension lambda / d.
+    k_b / (2 l^2) sum |x_(i+1) - 2 x_i + x_(i-1)|^2, of matrix k_b / l^2 D^T D with rows (1, -2, 1)
+    of D; a segment resists turning by tau = 8 pi eta a^3 w / d^2 and by its tension, lambda / d.
 Symbols: M = N_R + 1 spacing, N_seg segments, node i = 0 .. N_seg, w beads whose torque a segment
     carries, h effective step.
 Limits: open fibers, straight at rest; no twist.

@@ -8,7 +8,6 @@ Limits: first order in dt (torque, first half step); dt below `stability.step_li
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -54,7 +54,12 @@ class Overdamped(Method):
         self.node_motion = wp.zeros(nodes, dtype=p.vec3, device=device)  # of the last step
         self.node_back = wp.zeros(kept, dtype=p.vec3, device=device)
         self.velocity_back = wp.zeros(kept, dtype=p.vec3, device=device)
-        self.rows = wp.zeros(nodes, dtype=elimination_row(p.name), device=device)
+        # The fibers of a worker run one after the other and share rows, which then stay in its
+        # cache; what is allocated for the others is never touched.
+        most = 1 + max(row["segments"] for row in model.group_rows)
+        self.row_stride = -most if device.startswith("cpu") else most
+        row = elimination_row(p.name)
+        self.rows = wp.empty(most * model.fiber_count, dtype=row, device=device)
         self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
         chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
         self.error = wp.zeros(chunks, dtype=wp.float64, device=device)
@@ -117,6 +122,7 @@ class Overdamped(Method):
         inputs = [
             stages,
             1 if self.adaptive else 0,
+            self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
             self.stage_gradient,

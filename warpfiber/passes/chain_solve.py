@@ -37,6 +37,7 @@ def make_chain_step(name: str):
     """Kernel `chain_step`: one step of BDF2 (`stages` 1) or SDIRK2 (2) of every fiber.
 
     `keeps`: steps may be rejected, so the state of the start is kept and a tear left to the error.
+    `row_stride`: rows per fiber in `rows`; negative if all fibers of a launch share the first's.
     """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -45,7 +46,7 @@ def make_chain_step(name: str):
     flow_velocity, flow_spin = make_flow(name)
     torque_couple = make_torque(name)
     drag_diagonal, bending_entries, turning_resistance = make_chain_terms(name)
-    sym_mul, sym_inverse = make_sym_algebra(name)
+    sym_mul, block_inverse = make_sym_algebra(name)
     zero, one, two = real(0.0), real(1.0), real(2.0)
     tear, endless = real(TEAR_STRETCH), real(1.0e30)
     chi, inverse_chi, two_thirds = real(CHI), real(1.0 / CHI), real(2.0 / 3.0)
@@ -55,6 +56,7 @@ def make_chain_step(name: str):
         offset: wp.int32,
         stages: wp.int32,
         keeps: wp.int32,
+        row_stride: wp.int32,
         flow_origin: vec3,
         step_size: wp.array(dtype=wp.float64),
         stage_gradient: wp.array(dtype=mat33),
@@ -79,6 +81,13 @@ def make_chain_step(name: str):
         first = fiber_node_start[fiber]
         segments = g.segments
         dt = real(step_size[0])
+        # Rows of this fiber; where the fibers of a launch run one after the other they share them.
+        base = wp.abs(row_stride) * offset
+        if row_stride > 0:
+            base = row_stride * fiber
+        drag_end = g.drag * drag_diagonal(g.spacing, 0, segments)
+        drag_inner = g.drag * drag_diagonal(g.spacing, 1, 2)
+        drag_off = g.drag * g.coupling
         nothing = vec3(zero, zero, zero)
         stage = wp.int32(0)
         clipped = wp.int32(0)
@@ -178,14 +187,16 @@ def make_chain_step(name: str):
                         edge_after = x2 - x1
                         c_after = edge_after - edge
 
-                a_ii = drag_diagonal(g.spacing, k, segments)
+                drag = drag_inner
+                if k == 0 or k == segments:
+                    drag = drag_end
                 bend = bending_entries(k, segments)
-                r = g.drag * (a_ii * e0 + g.coupling * (e_before + e_after))
+                r = drag * e0 + drag_off * (e_before + e_after)
                 r += couple_before - couple
                 r -= kappa * (c_before - two * c_here + c_after)
 
                 # W and L
-                off = g.drag * g.coupling + kappa * bend[1] - rho_before
+                off = drag_off + kappa * bend[1] - rho_before
                 u = rho_before * n_before
                 w_0 = vec3(
                     off + u[0] * n_before[0] - kappa * l0[0],
@@ -210,12 +221,24 @@ def make_chain_step(name: str):
                 lt = vec3(wp.dot(w_0, q1), wp.dot(w_1, q1), wp.dot(w_2, q1)) + s1 * wt
 
                 # D and its inverse
-                alpha = g.drag * a_ii + kappa * bend[0] + rho_before + rho
+                alpha = drag + kappa * bend[0] + rho_before + rho
                 kappa2 = kappa * kappa
                 diagonal = vec3(
-                    alpha - u[0] * n_before[0] - rho * n[0] * n[0] - wp.dot(l0, w_0) - lt[0] * wt[0],
-                    alpha - u[1] * n_before[1] - rho * n[1] * n[1] - wp.dot(l1, w_1) - lt[1] * wt[1],
-                    alpha - u[2] * n_before[2] - rho * n[2] * n[2] - wp.dot(l2, w_2) - lt[2] * wt[2],
+                    alpha
+                    - u[0] * n_before[0]
+                    - rho * n[0] * n[0]
+                    - wp.dot(l0, w_0)
+                    - lt[0] * wt[0],
+                    alpha
+                    - u[1] * n_before[1]
+                    - rho * n[1] * n[1]
+                    - wp.dot(l1, w_1)
+                    - lt[1] * wt[1],
+                    alpha
+                    - u[2] * n_before[2]
+                    - rho * n[2] * n[2]
+                    - wp.dot(l2, w_2)
+                    - lt[2] * wt[2],
                 )
                 diagonal -= kappa2 * pd2
                 cross = vec3(
@@ -224,23 +247,15 @@ def make_chain_step(name: str):
                     -u[1] * n_before[2] - rho * n[1] * n[2] - wp.dot(l1, w_2) - lt[1] * wt[2],
                 )
                 cross -= kappa2 * po2
-                pd, po, pivots = sym_inverse(diagonal, cross)
                 along = n_before + vec3(
                     wp.dot(l0, n_before), wp.dot(l1, n_before), wp.dot(l2, n_before)
                 )
                 slack = one
                 if k > 0:
                     slack = compliance + wp.dot(n_before, t)
-                q = sym_mul(pd, po, along)
-                sigma = slack + wp.dot(along, q)
-                s = -one / sigma
-                smallest = wp.min(wp.min(pivots[0], pivots[1]), wp.min(pivots[2], sigma))
-                if not (smallest >= least):
-                    least = smallest
-                uq = q
-                q = -s * q
-                pd = pd - vec3(uq[0] * q[0], uq[1] * q[1], uq[2] * q[2])
-                po = po - vec3(uq[0] * q[1], uq[0] * q[2], uq[1] * q[2])
+                pd, po, q, s, sign = block_inverse(diagonal, cross, along, slack)
+                if not (sign >= least):
+                    least = sign
 
                 # y, and v = D^-1 y
                 y = r - vec3(wp.dot(w_0, v1), wp.dot(w_1, v1), wp.dot(w_2, v1))
@@ -260,7 +275,7 @@ def make_chain_step(name: str):
                 row.move = v
                 row.impulse = vt
                 row.axis = n
-                rows[i] = row
+                rows[base + k] = row
 
                 pd2 = pd1
                 po2 = po1
@@ -304,7 +319,7 @@ def make_chain_step(name: str):
                 for at in range(segments + 1):
                     k = segments - at
                     i = first + k
-                    row = rows[i]
+                    row = rows[base + k]
                     push = impulse * row.axis - kappa * z2
                     z = row.move + sym_mul(row.diagonal, row.off, push)
                     z -= z1[0] * l0 + z1[1] * l1 + z1[2] * l2

@@ -35,7 +35,7 @@ def elimination_row(name: str) -> Any:
 
 @cache
 def make_sym_algebra(name: str):
-    """`sym_mul(diagonal, off, v)` and `sym_inverse(diagonal, off)` by LDL^T, with its pivots."""
+    """`sym_mul(diagonal, off, v)` and `block_inverse` of a node's block."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     one = real(1.0)
@@ -49,21 +49,30 @@ def make_sym_algebra(name: str):
         )
 
     @wp.func
-    def sym_inverse(d: vec3, o: vec3):
-        i0 = one / d[0]
-        l10 = o[0] * i0
-        l20 = o[1] * i0
-        d1 = d[1] - l10 * o[0]
-        i1 = one / d1
-        c = o[2] - l20 * o[0]
-        l21 = c * i1
-        d2 = d[2] - l20 * o[1] - l21 * c
-        i2 = one / d2
-        m = l10 * l21 - l20
-        t = l21 * i2
-        mt = m * i2
-        diagonal = vec3(i0 + l10 * l10 * i1 + m * mt, i1 + l21 * t, i2)
-        off = vec3(-l10 * i1 - m * t, mt, -t)
-        return diagonal, off, vec3(d[0], d1, d2)
+    def block_inverse(d: vec3, o: vec3, g: vec3, slack: real):
+        """Inverse of [[A, g], [g^T, -slack]]: P, q, s, and a number > 0 if all pivots have signs.
 
-    return sym_mul, sym_inverse
+        By the adjugate of A: two divisions that do not wait for each other. Leading minors of A
+        have the signs of its pivots.
+        """
+        xx = d[1] * d[2] - o[2] * o[2]
+        yy = d[0] * d[2] - o[1] * o[1]
+        zz = d[0] * d[1] - o[0] * o[0]
+        xy = o[1] * o[2] - o[0] * d[2]
+        xz = o[0] * o[2] - o[1] * d[1]
+        yz = o[0] * o[1] - d[0] * o[2]
+        det = d[0] * xx + o[0] * xy + o[1] * xz
+        u = vec3(
+            xx * g[0] + xy * g[1] + xz * g[2],
+            xy * g[0] + yy * g[1] + yz * g[2],
+            xz * g[0] + yz * g[1] + zz * g[2],
+        )
+        whole = slack * det + wp.dot(g, u)
+        inverse = one / det
+        q = (one / whole) * u
+        diagonal = inverse * vec3(xx - u[0] * q[0], yy - u[1] * q[1], zz - u[2] * q[2])
+        off = inverse * vec3(xy - u[0] * q[1], xz - u[0] * q[2], yz - u[1] * q[2])
+        sign = wp.min(wp.min(d[0], zz), wp.min(det, whole))
+        return diagonal, off, q, -det * (one / whole), sign
+
+    return sym_mul, block_inverse

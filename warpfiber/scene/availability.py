@@ -73,7 +73,9 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
 def unavailable_in(method: str | None, table: str, key: str, value: object) -> str | None:
     """Return what to do instead if `method` cannot run `table.key = value`, else None."""
     rows = NOT_IN_METHOD.get(method or "", ())
-    return next((_refusal(row, value) for row in rows if (row.table, row.key) == (table, key)), None)
+    return next(
+        (_refusal(row, value) for row in rows if (row.table, row.key) == (table, key)), None
+    )
 
 
 def unavailable(table: str, key: str, value: object) -> str | None:

@@ -84,7 +84,9 @@ def _check_method(draft: Draft) -> None:
             draft.blame("numerics.tolerance", "the flow has no rate; give dt in s instead")
     for index, group in enumerate(draft.fibers):
         if draft.gravity is not None and group["density"] is None:
-            draft.faults.add(f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3")
+            draft.faults.add(
+                f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
+            )
 
 
 def _check_flow(draft: Draft) -> None:
