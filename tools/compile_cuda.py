@@ -50,7 +50,9 @@ from warpfiber.passes.step_control import (
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
 # Kernels that may have a stack frame: name of the kernel, largest frame in bytes, and why.
-FRAMES: dict[str, tuple[int, str]] = {}
+FRAMES: dict[str, tuple[int, str]] = {
+    "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
+}
 
 FORMAT_SIZED = 0x04
 ATTRIBUTE_FRAME = 0x11

@@ -124,7 +124,9 @@ segments = 19
 """
 
 
-@pytest.mark.parametrize("keys", [{}, {"numerics.integrator": "bdf2"}, {"numerics.tolerance": 1e-4}])
+@pytest.mark.parametrize(
+    "keys", [{}, {"numerics.integrator": "bdf2"}, {"numerics.tolerance": 1e-4}]
+)
 def test_resumed_job(tmp_path: Path, keys: dict[str, object]) -> None:
     """A run stopped by Ctrl-C and resumed writes the rows of the run without a stop."""
     path = tmp_path / "one.toml"
