@@ -104,22 +104,20 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     limits, dt = step_limits(scene), chosen_step(scene)
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
     if numerics.method == "overdamped":
-        rows.append(("dt limit", "none: stable at any step"))
-        share = (
-            f"strain {dt / limits[0].dt * LARGEST_STRAIN:.3g}"
-            if math.isfinite(limits[0].dt)
-            else ""
-        )
+        rows.append(("dt limit", f"none; a turn is followed up to a strain of {LARGEST_STRAIN}"))
+        share = ""
+        if math.isfinite(limits[0].dt):
+            share = f" = strain {dt / limits[0].dt * LARGEST_STRAIN:.3g}"
         if numerics.tolerance is not None:
             rows.append(("tolerance, lengths of a fiber", _number(numerics.tolerance)))
-            rows.append(("largest dt", f"{dt:.4g} s = {share}"))
+            rows.append(("largest dt", f"{dt:.4g} s{share}"))
             return rows
-        rows.append(("dt", f"{dt:.4g} s" + (f" = {share}" if share else "")))
+        rows.append(("dt", f"{dt:.4g} s{share}"))
     else:
         for limit in limits:
             rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
-        share = f"{dt / limits[0].dt:.3g}"
-        rows.append(("dt", f"{dt:.4g} s = {share} of the limit set by {limits[0].term}"))
+        share = f" = {dt / limits[0].dt:.3g} of the limit set by {limits[0].term}"
+        rows.append(("dt", f"{dt:.4g} s{share}"))
     strain = total_strain(scene)
     if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
         rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))

@@ -83,6 +83,8 @@ def _check_method(draft: Draft) -> None:
         elif draft.flow_object is not None and draft.flow_object.rate == 0.0:
             draft.blame("numerics.tolerance", "the flow has no rate; give dt in s instead")
     for index, group in enumerate(draft.fibers):
+        if draft.is_given(f"fibers.{index}.initial_velocity"):
+            draft.note(f"fibers.{index}.initial_velocity has no effect in method overdamped")
         if draft.gravity is not None and group["density"] is None:
             draft.faults.add(
                 f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
