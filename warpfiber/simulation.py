@@ -19,6 +19,7 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.passes.measurement import Measurement
+from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.placement import Placement, place_fibers
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 
@@ -307,10 +308,13 @@ class Simulation:
         limit = ""
         if math.isfinite(smallest.dt):
             limit = f", limit {smallest.dt:.4g} s set by {smallest.term}{reason}"
+        stretch = f"segment at {torn['stretch']:.3g} times its rest length"
+        what = f"fiber {torn['fiber']} is torn at node {torn['node']} ({stretch})"
+        if torn["stretch"] < TEAR_STRETCH:  # rejected steps have been taken back
+            what = f"fiber {torn['fiber']} meets the tolerance with no step that is worth taking"
         torn["message"] = (
             f"diverged at step {self.step_count}, time {self.time:.6g} s, strain "
-            f"{self.strain:.6g}: fiber {torn['fiber']} is torn at node {torn['node']} (segment at "
-            f"{torn['stretch']:.3g} times its rest length); largest term: {torn['largest_term']} "
+            f"{self.strain:.6g}: {what}; largest term: {torn['largest_term']} "
             f"({force:.3g} N); dt = {self.dt:.4g} s{limit}"
         )
         return torn

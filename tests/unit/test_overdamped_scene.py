@@ -63,6 +63,16 @@ def test_a_step_beyond_a_turn_is_refused() -> None:
     assert np.isfinite(simulation.node_pos).all()
 
 
+def test_a_tolerance_that_no_step_meets() -> None:
+    keys = {"numerics__tolerance": 1e-300, "fibers__0__direction": [1, 0.2, 0.3]}
+    simulation = wf.Simulation(fiber(numerics__method="overdamped", **keys))
+    before = simulation.node_pos
+    with pytest.raises(wf.Diverged, match="fiber 0 meets the tolerance with no step"):
+        simulation.step()
+    assert simulation.step_count == 0
+    assert simulation.node_pos.tobytes() == before.tobytes()
+
+
 def test_a_fluid_at_rest_needs_a_step() -> None:
     flow = {"flow__kind": "rest", "stage__0__end_time": 1.0}
     with pytest.raises(wf.SceneError, match=r"give numerics.dt in s"):
