@@ -208,6 +208,9 @@ class Overdamped(Method):
 
 
 def overdamped_bytes(nodes: int, segments: int, real: int, adaptive: bool) -> int:
-    """Bytes of the arrays above for reals of `real` bytes; on the CPU the rows cost next to none."""
+    """Bytes of the arrays above for reals of `real` bytes.
+
+    On the CPU the rows, by far the largest, are allocated but hardly touched.
+    """
     per_node = 28 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
     return real * (nodes * per_node + 2 * segments)
