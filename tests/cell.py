@@ -64,13 +64,17 @@ def cell_scene(
     *,
     numerics: dict[str, Any] | None = None,
     quantities: Sequence[str] = (),
+    groups: dict[str, Any] | None = None,
     **tables: Any,
 ) -> Scene:
-    """Scene with the given groups; `tables` override flow (at rest), contact (none), box, ..."""
+    """Scene with the given groups; `tables` override flow (at rest), contact (none), box, ...
+
+    `groups`: further keys of every [[fibers]].
+    """
     counts = np.bincount(np.asarray(fiber_kind), minlength=len(kinds))
     rows = []
     for kind, count in zip(kinds, counts, strict=True):
-        keys: dict[str, Any] = {}
+        keys: dict[str, Any] = dict(groups or {})
         if "box" not in tables:
             keys["position"] = [[0.0, 0.0, 0.0]] * int(count)
         rows.append(kind.table(int(count), **keys))

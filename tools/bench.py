@@ -2,7 +2,7 @@
 
     python tools/bench.py engine                  a dense cell: ns per segment-step of every pass
     python tools/bench.py beads                   1000 fibers of 20 beads: bead-steps per second
-    python tools/bench.py accuracy                one flexible fiber: run time against error
+    python tools/bench.py accuracy                one flexible fiber: time and error, both methods
     python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
     python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from bench_overdamped import overdamped_rows
 from machine import ROOT, commit, processor
 
 import warpfiber as wf
@@ -199,7 +200,10 @@ def cell_speed(
 
 
 def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Flexible fiber of Fig. 5: wall time to strain 40 and the worst tip error on the way."""
+    """Flexible fiber of Fig. 5: wall time to strain 40 and the worst tip error on the way.
+
+    With inertia, then without (`bench_overdamped`).
+    """
     for segments, closure in (
         (49, "consistent"),
         (25, "consistent"),
@@ -238,6 +242,7 @@ def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "error_kind": "tip z/L at strain 20, 30, 35, 40 against the full chain by RK4",
             }
             simulation.close()
+    yield from overdamped_rows(SCENES / "flexible.toml", args, common)
 
 
 def period(args: argparse.Namespace) -> Iterator[dict[str, Any]]:

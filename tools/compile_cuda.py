@@ -29,6 +29,7 @@ from typing import Any
 import warp as wp
 
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
+from warpfiber.passes.chain_solve import make_chain_step
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.measure import (
     MeasureFeatures,
@@ -39,11 +40,19 @@ from warpfiber.passes.measure import (
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.rows import make_row_kernels
+from warpfiber.passes.step_control import (
+    make_largest_error,
+    make_step_begin,
+    make_step_end,
+    make_take_back,
+)
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
 # Kernels that may have a stack frame: name of the kernel, largest frame in bytes, and why.
-FRAMES: dict[str, tuple[int, str]] = {}
+FRAMES: dict[str, tuple[int, str]] = {
+    "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
+}
 
 FORMAT_SIZED = 0x04
 ATTRIBUTE_FRAME = 0x11
@@ -158,6 +167,12 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     for sheared, scheduled in ((False, False), (True, False), (True, True)):
         variant = " ".join(["sheared"] * sheared + ["scheduled"] * scheduled) or "plain"
         yield "clock_step", variant, make_clock(precision, sheared, scheduled)
+    yield "step_begin", "", make_step_begin(precision)
+    yield "chain_step", "", make_chain_step(precision)
+    yield "largest_error", "", make_largest_error(precision)
+    yield "take_back", "", make_take_back(precision)
+    for variant, adaptive in (("plain", False), ("tolerance", True)):
+        yield "step_end", variant, make_step_end(precision, True, adaptive)
     for variant, nodes in _node_variants():
         yield "node_sweep", variant, make_node_sweep(precision, nodes)
     for variant, pairs in _pair_variants():
@@ -176,6 +191,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     for variant, fibers in {
         "orientation": MeasureFeatures(),
         "everything": MeasureFeatures(orientation4=True, energy=True, curvature=True),
+        "overdamped": MeasureFeatures(energy=True, curvature=True, inertia=False),
     }.items():
         yield "measure_fibers", variant, make_measure_fibers(precision, fibers)
     for variant, pairs in _pair_variants()[1:3]:

@@ -54,14 +54,17 @@ def _group_row(scene: Scene, group: FiberGroup, units: Units) -> dict[str, Any]:
         weight = bead * (density - scene.gravity.fluid_density)
         gravity = weight * np.asarray(scene.gravity.acceleration) / units.force
     reduced = m - 1.0
+    has_inertia = scene.numerics.method != "overdamped"
+    stretching = math.pi * a * (group.axial_modulus / stress) / (2.0 * m)
     inner = max(1, round(reduced)) if reduced > 1e-9 else 0
     return {
         "radius": a,
         "rest": 2.0 * a * m,
         "spacing": m,
-        "stretching": math.pi * a * (group.axial_modulus / stress) / (2.0 * m),
+        "stretching": stretching,
+        "compliance": 0.0 if group.inextensible else 1.0 / stretching,
         "bending": math.pi * a**3 * (group.bending_modulus / stress) / (8.0 * m),
-        "mass": bead * density / units.mass,
+        "mass": bead * density / units.mass if has_inertia else 0.0,
         "drag": 6.0 * math.pi * eta * a,
         "torque": 8.0 * math.pi * eta * a**3,
         "weight": m,

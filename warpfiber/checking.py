@@ -6,8 +6,10 @@ import math
 
 from warpfiber.methods.bead_chain import contact_reach
 from warpfiber.methods.box_limits import bearable_strain
+from warpfiber.methods.overdamped import overdamped_bytes
 from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import chosen_step, step_limits
+from warpfiber.methods.strain_steps import LARGEST_STRAIN
 from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
@@ -41,6 +43,9 @@ def memory_bytes(scene: Scene) -> float:
     nodes = sum(node_count(group) for group in scene.fibers)
     segments = sum(segment_count(group) for group in scene.fibers)
     size = nodes * _BYTES_PER_NODE * real
+    if scene.numerics.method == "overdamped":
+        adaptive = scene.numerics.tolerance is not None
+        size += overdamped_bytes(nodes, segments, round(8.0 * real), adaptive)
     if contact_reach(scene) > 0.0:
         pair = _BYTES_PER_PAIR + real * _REAL_BYTES_PER_PAIR[scene.contact.lubrication != "none"]
         size += segments * (_BYTES_PER_SEGMENT + real * _REAL_BYTES_PER_SEGMENT)
@@ -93,20 +98,39 @@ def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str,
     return rows
 
 
+def _step_lines(scene: Scene) -> list[tuple[str, str]]:
+    """Method, limits of the step, step and number of steps."""
+    numerics = scene.numerics
+    limits, dt = step_limits(scene), chosen_step(scene)
+    rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
+    if numerics.method == "overdamped":
+        rows.append(("dt limit", f"none; a turn is followed up to a strain of {LARGEST_STRAIN}"))
+        share = ""
+        if math.isfinite(limits[0].dt):
+            share = f" = strain {dt / limits[0].dt * LARGEST_STRAIN:.3g}"
+        if numerics.tolerance is not None:
+            rows.append(("tolerance, lengths of a fiber", _number(numerics.tolerance)))
+            rows.append(("largest dt", f"{dt:.4g} s{share}"))
+            return rows
+        rows.append(("dt", f"{dt:.4g} s{share}"))
+    else:
+        for limit in limits:
+            rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
+        share = f" = {dt / limits[0].dt:.3g} of the limit set by {limits[0].term}"
+        rows.append(("dt", f"{dt:.4g} s{share}"))
+    strain = total_strain(scene)
+    if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
+        rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
+    return rows
+
+
 def check_lines(scene: Scene) -> list[str]:
     """The report, one line per number."""
     rows: list[tuple[str, str]] = []
     for index, group in enumerate(scene.fibers):
         rows += _group_lines(scene, index, group)
     rows.append(("total strain", _number(total_strain(scene))))
-    limits, dt = step_limits(scene), chosen_step(scene)
-    for limit in limits:
-        rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
-    share = dt / limits[0].dt
-    rows.append(("dt", f"{dt:.4g} s = {share:.3g} of the limit set by {limits[0].term}"))
-    strain = total_strain(scene)
-    if strain is not None and scene.flow is not None and scene.flow.rate > 0.0:
-        rows.append(("steps", f"{strain / scene.flow.rate / dt:.4g}"))
+    rows += _step_lines(scene)
     if contact_reach(scene) > 0.0:
         skin = scene.numerics.skin
         text = f"auto, starts with {START_SKIN} diameters" if skin is None else f"{skin:.3g} m"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -121,9 +122,12 @@ class Job:
         """One line: counts, dt and what limits it."""
         model, limit = self.simulation.model, self.simulation.limits[0]
         warning = f"not {limit.kind}: above its " if self.simulation.dt > limit.dt else ""
+        bound = f" ({warning}limit {limit.dt:.4g} s, {limit.term})"
+        if not math.isfinite(limit.dt):
+            bound = ""
         return (
             f"{model.fiber_count} fibers, {model.segment_count} segments, "
-            f"dt {self.simulation.dt:.4g} s ({warning}limit {limit.dt:.4g} s, {limit.term}), "
+            f"dt {self.simulation.dt:.4g} s{bound}, "
             f"{self.scene.numerics.precision} on {self.simulation.device}, "
             f"workers {self.simulation.method.workers}"
         )

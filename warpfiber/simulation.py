@@ -15,14 +15,19 @@ import warp as wp
 
 from warpfiber.build import build, realized_scene
 from warpfiber.methods.bead_chain import BeadChain
+from warpfiber.methods.method import Method
+from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.passes.measurement import Measurement
+from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.placement import Placement, place_fibers
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
 
-# What a checkpoint holds: every array that the next step depends on.
+METHODS: dict[str, type[Method]] = {"bead_chain": BeadChain, "overdamped": Overdamped}
+
+# What a checkpoint holds beside what the method saves: arrays that the next step depends on.
 _ARRAYS = (
     "node_pos node_velocity fiber_image lattice deformation list_pos list_lattice step time strain"
 ).split()
@@ -121,7 +126,8 @@ class Simulation:
         self.device = choose_device(self.scene, segments)
         self.model, self.state, self.placement_report = build(self.scene, self.device, placement)
         wanted = workers if workers is not None else scene.numerics.workers
-        self.method = BeadChain(self.scene, self.model, self.state, self.dt, wanted)
+        method = METHODS[self.scene.numerics.method]
+        self.method = method(self.scene, self.model, self.state, self.dt, wanted)
         self.measurement = Measurement(
             self.model,
             self.state,
@@ -129,6 +135,7 @@ class Simulation:
             self.method.pair_features,
             self.method.strength,
             self.method.decay,
+            self.method.inertia,
         )
 
     # -- stepping ---------------------------------------------------------------------------------
@@ -272,9 +279,7 @@ class Simulation:
         """Copies of every array that the next step depends on, in run units and full precision."""
         self.prepare()
         arrays = {name: getattr(self.state, name).numpy().copy() for name in _ARRAYS}
-        if self.method.list is not None and self.method.skin is not None:
-            arrays["stretch_allowed"] = np.asarray(self.method.list.stretch_allowed)
-            arrays["skin"] = self.method.skin.saved()
+        arrays |= self.method.saved()
         if self.measurement.angle is not None:
             arrays["angle"] = self.measurement.angle.copy()
         return arrays
@@ -285,17 +290,7 @@ class Simulation:
         state.status.fill_(0)
         for name in _ARRAYS:
             getattr(state, name).assign(arrays[name])
-        if self.method.list is not None and self.method.skin is not None:
-            # the list of the snapshot was built from other positions: build the same one again
-            self.method.set_stretch(float(arrays["stretch_allowed"]))
-            self.method.set_skin(float(arrays["skin"][0]))
-            self.method.skin.begun = self.step_count
-            state.node_pos.assign(arrays["list_pos"])
-            state.lattice.assign(arrays["list_lattice"])
-            self.method.refresh_list(wrap=False)
-            self.method.skin.restore(arrays["skin"])
-            for name in ("node_pos", "lattice", "deformation"):
-                getattr(state, name).assign(arrays[name])
+        self.method.restore(arrays)
         self.method.set_gradient()
         if self.measurement.angle is not None:
             self.measurement.angle = np.asarray(arrays["angle"])
@@ -309,12 +304,17 @@ class Simulation:
         reason = ""
         if self.dt < smallest.dt:
             reason = "; dt is below it: too soft a fiber for this flow, or a start that overlaps"
+        limit = ""
+        if math.isfinite(smallest.dt):
+            limit = f", limit {smallest.dt:.4g} s set by {smallest.term}{reason}"
+        stretch = f"segment at {torn['stretch']:.3g} times its rest length"
+        what = f"fiber {torn['fiber']} is torn at node {torn['node']} ({stretch})"
+        if torn["stretch"] < TEAR_STRETCH:  # rejected steps have been taken back
+            what = f"fiber {torn['fiber']} meets the tolerance with no step that is worth taking"
         torn["message"] = (
             f"diverged at step {self.step_count}, time {self.time:.6g} s, strain "
-            f"{self.strain:.6g}: fiber {torn['fiber']} is torn at node {torn['node']} (segment at "
-            f"{torn['stretch']:.3g} times its rest length); largest term: {torn['largest_term']} "
-            f"({force:.3g} N); dt = {self.dt:.4g} s, limit {smallest.dt:.4g} s set by "
-            f"{smallest.term}{reason}"
+            f"{self.strain:.6g}: {what}; largest term: {torn['largest_term']} "
+            f"({force:.3g} N); dt = {self.dt:.4g} s{limit}"
         )
         return torn
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from importlib import metadata
@@ -85,7 +86,7 @@ class Summary:
         """Everything for `summary.json`."""
         simulation, model = self.simulation, self.simulation.model
         segments = model.segment_count
-        pairs = simulation.method.list
+        pairs, limit = simulation.method.list, simulation.limits[0]
         per_segment = 1e9 / max(1, segments)
         passes = {
             name: round(sorted(times)[len(times) // 2] * per_segment, 2)
@@ -106,10 +107,12 @@ class Summary:
                 "list_growths": pairs.grow_count if pairs else 0,
             },
             "list": simulation.method.list_report(),
+            "method": simulation.scene.numerics.method,
             "steps": simulation.step_count,
             "dt": simulation.dt,
-            "dt_limit": simulation.limits[0].dt,
-            "dt_limit_term": simulation.limits[0].term,
+            **simulation.method.step_report(),
+            "dt_limit": limit.dt if math.isfinite(limit.dt) else None,
+            "dt_limit_term": limit.term,
             "wall_seconds": round(self.wall_seconds, 3),
             "setup_seconds": round(self.setup_seconds, 3),
             "stepping_seconds": round(self.stepping_seconds, 3),

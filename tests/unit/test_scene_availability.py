@@ -7,6 +7,7 @@ import tomllib
 import pytest
 
 from tests.scene_text import GONE, changed, faults_of
+from warpfiber.scene import scene_from_dict
 
 BONDED_SPHERES = """
 [box]
@@ -50,7 +51,7 @@ segments = 26
 
 
 NOT_YET: list[tuple[dict[str, object], str]] = [
-    ({"numerics.method": "overdamped"}, "numerics.method"),
+    ({"numerics.method": "rigid_rod"}, "numerics.method"),
     ({"numerics.method": "auto"}, "numerics.method"),
     ({"numerics.contact": "unilateral"}, "numerics.contact"),
     ({"flow.kind": "field", "flow.file": "a.npz"}, "flow.kind"),
@@ -76,6 +77,47 @@ def test_known_but_not_in_this_version(changes: dict[str, object], key: str) -> 
     faults = faults_of(changed(changes))
     assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
     assert "not available in this version; " in faults[0].remedy
+
+
+OVERDAMPED: dict[str, object] = {
+    "numerics.method": "overdamped",
+    "contact.law": "none",
+    "contact.lubrication": GONE,
+    "box.boundary": ["periodic", "open", "periodic"],
+    "fibers.0.density": GONE,
+}
+
+NOT_OVERDAMPED: list[tuple[dict[str, object], str, str]] = [
+    ({"contact": GONE}, "contact.law", "the default is not available"),
+    ({"contact.law": "exponential"}, "contact.law", 'use "none", or method = "bead_chain"'),
+    ({"box.boundary": ["periodic", "wall", "wall"]}, "box.boundary", "wall is not available"),
+    ({"numerics.closure": "paper"}, "numerics.closure", 'use closure = "consistent"'),
+    ({"numerics.integrator": "bdf2", "numerics.tolerance": 1e-3}, "numerics.tolerance", "sdirk2"),
+    (
+        {"flow.kind": "rest", "stage.0.end_time": 1, "numerics.tolerance": 0.1},
+        "numerics.tolerance",
+        "give dt in s",
+    ),
+    ({"gravity": {}}, "fibers.0.density", "missing"),
+    ({"flow": GONE, "stage.0.end_time": 1}, "flow", "missing: overdamped moves fibers by drag"),
+]
+
+
+def test_overdamped_without_pairs_and_walls() -> None:
+    """The scene that the cases below change loads, with a list of words left to the method."""
+    scene = scene_from_dict(changed(OVERDAMPED))
+    assert scene.numerics.integrator == "sdirk2"
+    assert scene.fibers[0].density is None
+    free = scene_from_dict(changed(OVERDAMPED | {"fibers.0.inextensible": True}))
+    assert free.fibers[0].inextensible
+
+
+@pytest.mark.parametrize(("changes", "key", "advice"), NOT_OVERDAMPED)
+def test_what_overdamped_cannot_run(changes: dict[str, object], key: str, advice: str) -> None:
+    """Pairs, walls and other closures are refused with what to do instead."""
+    faults = faults_of(changed(OVERDAMPED | changes))
+    assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
+    assert advice in faults[0].remedy
 
 
 def test_start_is_known() -> None:

@@ -8,10 +8,8 @@ Limits: first order in dt (torque, first half step); dt below `stability.step_li
 
 from __future__ import annotations
 
-import math
-import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,19 +18,15 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.methods.box_limits import bearable_strain, lasting_height
+from warpfiber.methods.method import Method
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
-from warpfiber.model import BAD_FIBER, EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
-from warpfiber.passes.executor import Executor, load_kernels
-from warpfiber.passes.measure import TERMS
-from warpfiber.passes.measurement import measure_fiber_terms
+from warpfiber.model import EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
+from warpfiber.passes.executor import Call, Launch, load_kernels
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
 
-# Below this many segments the hand-off between workers costs more than it saves.
-WORKER_BREAK_EVEN = 5000
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 STRETCH_GROWTH = 1.2  # how much longer segments may be after they outgrew the cells of the list
 
@@ -44,22 +38,16 @@ def contact_reach(scene: Scene) -> float:
     return RANGE if scene.contact.law != "none" else 0.0
 
 
-class BeadChain:
+class BeadChain(Method):
     """Advances a State by the explicit bead chain."""
 
     def __init__(
         self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
     ) -> None:
-        self.scene, self.model, self.state = scene, model, state
-        self.dt = dt / model.units.time
-        self.workers = self._choose_workers(workers)
+        super().__init__(scene, model, state, dt, workers)
         self.native = NATIVE and model.device.startswith("cpu")
         self.native_nodes = self.native  # where it applies; both are read by `prepare`
         units, contact, domain = model.units, scene.contact, model.domain
-        self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
-        self.flow_origin = np.zeros(3)
-        if scene.flow is not None and scene.flow.origin is not None:
-            self.flow_origin = np.asarray(scene.flow.origin) / units.length
         self.strength = (contact.strength or 0.0) / units.force
         self.decay = contact.decay or 0.0
         self.has_pairs = contact_reach(scene) > 0.0 and model.segment_count > 1
@@ -69,11 +57,6 @@ class BeadChain:
             periodic=any(domain.periodic),
             sheared=domain.sheared,
         )
-        self.list: NeighborList | None = None
-        self.skin: SkinChoice | None = None
-        self.list_seconds = 0.0
-        self.strain_end = math.inf  # where a deforming box becomes too flat
-        self.set_gradient()
         if self.has_pairs:
             largest = max(row["radius"] for row in model.group_rows)
             longest = max(row["rest"] for row in model.group_rows)
@@ -93,21 +76,10 @@ class BeadChain:
             self.skin = self._skin_choice(skin, largest)
             self.check_box()
         self._allocate_pair_results()
-        self.executor: Executor | None = None
-        self._status_view: np.ndarray | None = None
 
-    def _choose_workers(self, workers: int | None) -> int:
-        if not self.model.device.startswith("cpu"):
-            return 1
-        if workers is not None:
-            return workers
-        if self.model.segment_count < WORKER_BREAK_EVEN:
-            return 1
-        try:
-            cores = len(os.sched_getaffinity(0))
-        except AttributeError:  # only Linux tells which cores this process may use
-            cores = os.cpu_count() or 1
-        return min(2, cores)
+    def launches(self) -> list[Launch | Call]:
+        """Clock, pairs and nodes."""
+        return [*step_launches(self)]
 
     def _skin_choice(self, skin: float, largest: float) -> SkinChoice:
         """The start skin, and between what it may change."""
@@ -135,16 +107,6 @@ class BeadChain:
         room -= self.list.cell_width - self.list.skin
         return max(start, min(2.0 * MOST_SKIN * radius, room * (1.0 - 1e-9)))
 
-    def _segment_stretch(self) -> np.ndarray:
-        """(S,) length of every segment now, in its rest length."""
-        model = self.model
-        nodes = self.state.node_pos.numpy().astype(float)
-        first = model.host["segment_node"]
-        rest = np.asarray([row["rest"] for row in model.group_rows])
-        mine = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
-        lengths: np.ndarray = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine
-        return lengths
-
     def check_box(self) -> None:
         """Find the strain the box can bear; raises SceneError if it is too small from the start."""
         self.strain_end = bearable_strain(self.scene, self.box_width * self.model.units.length)
@@ -158,19 +120,6 @@ class BeadChain:
         if self.list is None or self.skin is None:
             return 0.0
         return self.list.cell_width - self.list.skin + self.skin.start
-
-    def set_gradient(self) -> None:
-        """The flow's gradient at the present strain, before the first step sets it."""
-        p, scene = self.model.precision, self.scene
-        full = np.zeros((3, 3))
-        if scene.flow is not None and scene.flow.velocity_gradient is not None:
-            full = np.asarray(scene.flow.velocity_gradient) * self.model.units.time
-        self.full_gradient = full
-        schedule = scene.flow.schedule if scene.flow and scene.flow.schedule else ((0.0, 1.0),)
-        self.schedule = np.asarray(schedule, dtype=np.float64)
-        strain = float(self.state.strain.numpy()[0])
-        factor = scene.flow.factor(strain) if scene.flow else 1.0
-        self.state.gradient.assign((full * factor)[None].astype(p.numpy))
 
     def _allocate_pair_results(self) -> None:
         p, device = self.model.precision, self.model.device
@@ -200,14 +149,6 @@ class BeadChain:
         self.skin.set_skin(skin)
         if skin != self.list.skin:
             self.list.set_skin(skin)
-
-    def time_passes(self, steps: int) -> dict[str, float]:
-        """Seconds per step of every launch and of the list, over `steps` steps of the run."""
-        self.prepare()
-        assert self.executor is not None
-        times = self.executor.time_launches(steps, self._halted)
-        self._settle()  # a torn fiber is left to the next `advance`
-        return times
 
     def refresh_list(self, *, wrap: bool = True) -> None:
         """Build the neighbor list now (also clears its expiry)."""
@@ -250,19 +191,7 @@ class BeadChain:
             load_kernels([*stepping, *listing, *measuring], self.model.device)
         if self.list is not None and self.list.build_count == 0:
             self.refresh_list()
-        if self.executor is None:
-            self.executor = Executor(step_launches(self), self.model.device, self.workers)
-
-    def advance(self, steps: int) -> bool:
-        """Run up to `steps` steps, rebuilding the list where it expires; False if a fiber tore."""
-        target = self.step_count + steps
-        while self.step_count < target:
-            self.prepare()
-            assert self.executor is not None
-            self.executor.run(target - self.step_count, self._halted)
-            if not self._settle():
-                return False
-        return True
+        super().prepare()
 
     def _settle(self) -> bool:
         """Do what halted the steps asks for, so that nothing is pending; False if a fiber tore."""
@@ -280,53 +209,32 @@ class BeadChain:
             self.refresh_list()
         return True
 
-    def _halted(self) -> bool:
-        status = self._status()
-        return bool(status[EXPIRED] or status[TORN] or status[STRETCHED])
-
-    def _status(self) -> np.ndarray:
-        """The status words: on the CPU a view that is made once, looked at after every graph."""
-        if self._status_view is None or not self.model.device.startswith("cpu"):
-            self._status_view = self.state.status.numpy()
-        return self._status_view
-
-    @property
-    def step_count(self) -> int:
-        """Steps taken."""
-        return int(self.state.step.numpy()[0])
-
     def close(self) -> None:
         """Stop worker threads."""
-        self._stop_executor()
+        super().close()
         if self.list is not None:
             self.list.close()
 
-    def _stop_executor(self) -> None:
-        if self.executor is not None:
-            self.executor.close()
-            self.executor = None
+    # -- what is saved ----------------------------------------------------------------------------
 
-    # -- what went wrong --------------------------------------------------------------------------
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next list depends on."""
+        if self.list is None or self.skin is None:
+            return {}
+        allowed = np.asarray(self.list.stretch_allowed)
+        return {"stretch_allowed": allowed, "skin": self.skin.saved()}
 
-    def torn_fiber(self) -> dict[str, Any]:
-        """First torn fiber, its worst node, and its largest force term (N) after `advance`."""
-        model, state = self.model, self.state
-        stretch = self._segment_stretch()
-        bad = np.flatnonzero(~(stretch < TEAR_STRETCH))
-        fiber = int(state.status.numpy()[BAD_FIBER])
-        if len(bad):  # several may have torn in one step, in any order
-            fiber = int(model.host["segment_fiber"][bad[0]])
-        sizes = measure_fiber_terms(
-            model, state, fiber, self.flow_origin, self.list, self.pair_acts, self.pair_force
-        )
-        mine = stretch[model.host["segment_fiber"] == fiber]
-        worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))
-        known = np.isfinite(sizes).any()
-        largest = int(np.argmax(np.where(np.isfinite(sizes), sizes, -1.0 if known else 0.0)))
-        return {
-            "fiber": fiber,
-            "node": worst,
-            "terms": dict(zip(TERMS, map(float, sizes), strict=True)),
-            "largest_term": TERMS[largest],
-            "stretch": float(mine[worst]),
-        }
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Build again the list that the saved run had, which was built from older positions."""
+        if self.list is None or self.skin is None:
+            return
+        state = self.state
+        self.set_stretch(float(arrays["stretch_allowed"]))
+        self.set_skin(float(arrays["skin"][0]))
+        self.skin.begun = self.step_count
+        state.node_pos.assign(arrays["list_pos"])
+        state.lattice.assign(arrays["list_lattice"])
+        self.refresh_list(wrap=False)
+        self.skin.restore(arrays["skin"])
+        for name in ("node_pos", "lattice", "deformation"):
+            getattr(state, name).assign(arrays[name])

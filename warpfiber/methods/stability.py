@@ -1,4 +1,4 @@
-"""Largest step of the explicit bead chain, term by term: stable, and accurate in the flow.
+"""Largest step of the explicit bead chain, term by term, and the step that a scene takes.
 
 Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
     max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
+from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
 
 Matrix = np.ndarray
 CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
 FLOW_STRAIN = 0.02  # largest strain of a step
-FLOW_TERM = "flow"
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,8 @@ class StepLimit:
     term: str
     dt: float
     group: int
-
-    @property
-    def kind(self) -> str:
-        """What a step up to it is: `stable`, or `accurate` where the flow decides."""
-        return "accurate" if self.term == FLOW_TERM else "stable"
+    kind: str = "stable"
+    """what a step up to it is: `stable`, or `accurate` where the flow decides"""
 
 
 def stable_limit(stiffness: Matrix, damping: Matrix, mass: Matrix, drag: Matrix) -> float:
@@ -113,7 +110,7 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
-    mass = 4.0 / 3.0 * math.pi * a**3 * group.density
+    mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)
     zeta = 6.0 * math.pi * eta * a
     axial, bending, torque, galerkin = _matrices(group, eta, scene.numerics.torque_weights)
     n = group.segments
@@ -141,7 +138,7 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
         factors = [abs(factor) for _, factor in scene.flow.schedule or ((0.0, 1.0),)]
         rate = np.abs(scene.flow.velocity_gradient).max() * max(factors)
         if rate > 0.0:
-            limits.append(StepLimit(FLOW_TERM, FLOW_STRAIN / rate, index))
+            limits.append(StepLimit("flow", FLOW_STRAIN / rate, index, "accurate"))
     contact = scene.contact
     if contact.strength:  # walls push by it even without pairs
         steepness = contact.decay / (2.0 * a)
@@ -156,7 +153,10 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
 
 
 def step_limits(scene: Scene) -> list[StepLimit]:
-    """All limits of all groups, smallest first."""
+    """All limits of all groups, smallest first; `overdamped` has none but the strain of a step."""
+    if scene.numerics.method == "overdamped":
+        dt = largest_step(scene)
+        return [StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0, "accurate")]
     limits = [limit for i in range(len(scene.fibers)) for limit in _group_limits(scene, i)]
     return sorted(limits, key=lambda limit: limit.dt)
 
@@ -164,6 +164,8 @@ def step_limits(scene: Scene) -> list[StepLimit]:
 def chosen_step(scene: Scene) -> float:
     """dt in s: given (or from the strain step), or `dt_fraction` of the smallest limit."""
     numerics = scene.numerics
+    if numerics.method == "overdamped":
+        return strain_step(scene)
     if numerics.dt is not None:
         return numerics.dt
     return numerics.dt_fraction * step_limits(scene)[0].dt

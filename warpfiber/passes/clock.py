@@ -12,10 +12,8 @@ from warpfiber.model import EXPIRED, HALT, STRETCHED, TORN, precision
 
 
 @cache
-def make_clock(name: str, sheared: bool, scheduled: bool):
-    """Kernel `clock_step` (one thread)."""
-    p = precision(name)
-    mat33 = p.mat33
+def make_flow_history():
+    """`rate_factor(strain, schedule)` and `lattice_push(L dt)` = exp(L dt), in float64."""
 
     @wp.func
     def rate_factor(strain: wp.float64, schedule: wp.array(dtype=wp.vec2d)) -> wp.float64:
@@ -28,6 +26,26 @@ def make_clock(name: str, sheared: bool, scheduled: bool):
                 w = (strain - schedule[k - 1][0]) / (schedule[k][0] - schedule[k - 1][0])
                 return (wp.float64(1.0) - w) * schedule[k - 1][1] + w * schedule[k][1]
         return schedule[n - 1][1]
+
+    @wp.func
+    def lattice_push(x: wp.mat33d) -> wp.mat33d:
+        one = wp.identity(n=3, dtype=wp.float64)
+        return one + x * (
+            one
+            + (x * (one + (x * (one + x * wp.float64(0.25))) * wp.float64(1.0 / 3.0)))
+            * wp.float64(0.5)
+        )
+
+    return rate_factor, lattice_push
+
+
+@cache
+def make_clock(name: str, sheared: bool, scheduled: bool):
+    """Kernel `clock_step` (one thread)."""
+    p = precision(name)
+    mat33 = p.mat33
+
+    rate_factor, lattice_push = make_flow_history()
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def clock_step(
@@ -55,13 +73,7 @@ def make_clock(name: str, sheared: bool, scheduled: bool):
         gradient = factor * full_gradient
         gradient_out[0] = mat33(gradient)
         lattice_now_out[0] = mat33(lattice[0])
-        x = dt * gradient
-        one = wp.identity(n=3, dtype=wp.float64)
-        push = one + x * (
-            one
-            + (x * (one + (x * (one + x * wp.float64(0.25))) * wp.float64(1.0 / 3.0)))
-            * wp.float64(0.5)
-        )
+        push = lattice_push(dt * gradient)
         if wp.static(sheared):
             lattice[0] = push * lattice[0]
         deformation[0] = push * deformation[0]

@@ -50,6 +50,8 @@ class MeasureFeatures:
     energy: bool = False
     curvature: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)  # with energy: potential of the walls
+    # without it the mass is 0, and bending energy is that of law `chain_terms`
+    inertia: bool = True
 
 
 @cache
@@ -60,6 +62,7 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
     Group = group_struct(name)
     bending_angle, _ = make_bending(name)
     has_energy, has_curvature = features.energy, features.curvature
+    has_inertia = features.inertia
     has_tensor4 = features.orientation4
     first_tensor4 = len(FIBER_SUMS)
     wall_x, wall_y, wall_z = features.walls
@@ -153,6 +156,7 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
                         node_pos[i], g.radius, wall_low, wall_high, strength, decay
                     )
             n0 = vec3(real(0.0), real(0.0), real(0.0))
+            edge0 = axis
             for k in range(g.segments):
                 edge = wp.vec3d(node_pos[first + k + 1] - node_pos[first + k])
                 d = wp.length(edge)
@@ -179,20 +183,25 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
                         beads += wp.dot(v0, v0)
                     sums_out[chunk, 13] = sums_out[chunk, 13] + half * wp.float64(g.mass) * beads
                     pulled = strain * rest
-                    sums_out[chunk, 14] = (
-                        sums_out[chunk, 14] + half * wp.float64(g.stretching) * pulled * pulled
-                    )
+                    if g.compliance > real(0.0):
+                        sums_out[chunk, 14] = (
+                            sums_out[chunk, 14] + half * wp.float64(g.stretching) * pulled * pulled
+                        )
                 if wp.static(has_energy or has_curvature):
                     n1 = vec3(n)
                     if k > 0:
                         angle = wp.float64(bending_angle(n0, n1))
+                        bent = angle * angle
+                        if wp.static(not has_inertia):
+                            bent = wp.length_sq(edge - edge0) / (rest * rest)
                         sums_out[chunk, 15] = (
-                            sums_out[chunk, 15] + half * wp.float64(g.bending) * angle * angle
+                            sums_out[chunk, 15] + half * wp.float64(g.bending) * bent
                         )
                         curvature = angle / rest
                         sums_out[chunk, 16] = sums_out[chunk, 16] + curvature * rest
                         maxima_out[chunk, 1] = wp.max(maxima_out[chunk, 1], curvature)
                     n0 = n1
+                edge0 = edge
 
     return measure_fibers
 

@@ -45,8 +45,10 @@ class Measurement:
         pair_features: PairFeatures,
         strength: float,
         decay: float,
+        inertia: bool = True,
     ) -> None:
         self.model, self.state = model, state
+        self.inertia = inertia
         self.quantities = frozenset(quantities)
         self.pair_features = pair_features
         self.strength, self.decay = strength, decay
@@ -102,6 +104,7 @@ class Measurement:
             energy="energy" in wanted,
             curvature="curvature" in wanted,
             walls=self.model.domain.wall if self.strength > 0.0 else no_walls,
+            inertia=self.inertia,
         )
 
     def _fiber_row(self) -> dict[str, float]:
@@ -141,7 +144,8 @@ class Measurement:
             row["curvature_mean"] = sums["curvature"] / sums["length"] / model.units.length
             row["curvature_max"] = largest[1] / model.units.length
         if features.energy:
-            names = ["energy_kinetic", "energy_stretching", "energy_bending"]
+            names = ["energy_kinetic"] if features.inertia else []
+            names += ["energy_stretching", "energy_bending"]
             names += ["energy_wall"] if any(features.walls) else []
             row |= {name: sums[name] * model.units.energy for name in names}
         return {name: float(value) for name, value in row.items()}

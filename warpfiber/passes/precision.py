@@ -22,6 +22,7 @@ def group_struct(name: str) -> Any:
         rest: real  # l = 2 a M, rest length of a segment
         spacing: real  # M = N_R + 1, segment length in diameters
         stretching: real  # k_s = pi a E / (2 M)
+        compliance: real  # 1 / k_s, 0 for segments that keep their length
         bending: real  # k_b = pi a^3 E_b / (8 M)
         mass: real  # m of one bead
         drag: real  # zeta = 6 pi eta a

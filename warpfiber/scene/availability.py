@@ -19,7 +19,7 @@ class Row:
     advice: str
 
 
-METHOD_ADVICE = 'use method = "bead_chain"'
+METHOD_ADVICE = 'use method = "bead_chain", or "overdamped"'
 FIBER_ADVICE = "give several [[fibers]] groups instead"
 STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
 
@@ -28,7 +28,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("fibers", "layers", (), FIBER_ADVICE),
     Row("fibers", "length_distribution", (), FIBER_ADVICE),
-    Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
     Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
     Row("contact", "law", ("none", "exponential"), 'use law = "exponential" or "none"'),
@@ -45,12 +44,38 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
-    Row("numerics", "method", ("bead_chain",), METHOD_ADVICE),
+    Row("numerics", "method", ("bead_chain", "overdamped"), METHOD_ADVICE),
     Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
     Row("load", "", (), "remove the table; fibers move freely"),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
+
+
+ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
+
+NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
+    "bead_chain": (
+        Row("fibers", "inextensible", (False,),
+            'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
+    ),
+    "overdamped": (
+        Row("contact", "law", ("none",), ALONE_ADVICE),
+        Row("contact", "lubrication", ("none",), ALONE_ADVICE),
+        Row("box", "boundary", ("periodic", "open"),
+            'walls of overdamped do not push; use "periodic" or "open", or method = "bead_chain"'),
+        Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
+    ),
+}  # fmt: skip
+"""Values that run with one method only, defaults included."""
+
+
+def unavailable_in(method: str | None, table: str, key: str, value: object) -> str | None:
+    """Return what to do instead if `method` cannot run `table.key = value`, else None."""
+    rows = NOT_IN_METHOD.get(method or "", ())
+    return next(
+        (_refusal(row, value) for row in rows if (row.table, row.key) == (table, key)), None
+    )
 
 
 def unavailable(table: str, key: str, value: object) -> str | None:
@@ -61,10 +86,16 @@ def unavailable(table: str, key: str, value: object) -> str | None:
     for row in NOT_IN_THIS_VERSION:
         if (row.table, row.key) != (table, key):
             continue
-        entries = value if isinstance(value, tuple) else (value,)
-        missing = [entry for entry in entries if entry not in row.available]
-        if missing or not row.available:
-            names = ", ".join(str(entry) for entry in missing) if row.available else ""
-            subject = f"{names} is " if isinstance(value, tuple) and names else ""
-            return f"{subject}not available in this version; {row.advice}"
+        return _refusal(row, value)
     return None
+
+
+def _refusal(row: Row, value: object) -> str | None:
+    """Return what is wrong with a value of a row, None if it is available."""
+    entries = value if isinstance(value, tuple) else (value,)
+    missing = [entry for entry in entries if entry not in row.available]
+    if row.available and not missing:
+        return None
+    names = ", ".join(dict.fromkeys(str(entry) for entry in missing)) if row.available else ""
+    subject = f"{names} is " if isinstance(value, tuple) and names else ""
+    return f"{subject}not available in this version; {row.advice}"

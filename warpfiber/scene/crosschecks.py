@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
 from warpfiber.scene.derived import reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
@@ -16,6 +17,8 @@ from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
+DRAGGED = ("bead_chain", "overdamped")
+"""Methods without another cause of motion than a fluid."""
 HOPELESS_FRACTION = 0.9
 """Volume fraction that no packing of straight fibers reaches: touching parallel cylinders fill
 pi/(2 sqrt 3) = 0.907."""
@@ -26,6 +29,7 @@ WALL_GAP = 1e-3
 def cross_check(draft: Draft) -> None:
     """Run all rules; faults and notes go to the draft's list."""
     _check_tables(draft)
+    _check_method(draft)
     _check_flow(draft)
     _check_flow_in_box(draft)
     _check_periodic_edges(draft)
@@ -49,9 +53,42 @@ def _check_tables(draft: Draft) -> None:
         draft.faults.add("fibers", None, "missing; add at least one [[fibers]]")
     if not draft.stages and not draft.faulty("stage"):
         draft.faults.add("stage", None, 'missing; add a [[stage]] with kind = "flow"')
-    if draft.method == "bead_chain" and not draft.is_given("flow"):
+    if draft.method in DRAGGED and not draft.is_given("flow"):
         remedy = 'add [flow] with kind and viscosity (kind = "rest" for a still fluid)'
-        draft.faults.add("flow", None, f"missing: bead_chain moves fibers by drag; {remedy}")
+        draft.faults.add("flow", None, f"missing: {draft.method} moves fibers by drag; {remedy}")
+
+
+def _check_method(draft: Draft) -> None:
+    """What the method cannot run, defaults included, and what its step and weight need."""
+    for row in NOT_IN_METHOD.get(draft.method or "", ()):
+        tables: dict[str, Values | None]
+        if row.table == "fibers":
+            tables = {f"fibers.{index}": group for index, group in enumerate(draft.fibers)}
+        else:
+            tables = {row.table: getattr(draft, row.table)}
+        for path, values in tables.items():
+            value = values[row.key] if values is not None else None
+            remedy = unavailable_in(draft.method, row.table, row.key, value)
+            if value is not None and remedy is not None:
+                given = draft.is_given(f"{path}.{row.key}")
+                draft.faults.add(
+                    f"{path}.{row.key}", value, remedy if given else f"the default is {remedy}"
+                )
+    if draft.method != "overdamped":
+        return
+    if draft.numerics["tolerance"] is not None:
+        if draft.numerics["integrator"] == "bdf2":
+            remedy = 'bdf2 takes steps of one size; use integrator = "sdirk2", or dt'
+            draft.blame("numerics.tolerance", remedy)
+        elif draft.flow_object is not None and draft.flow_object.rate == 0.0:
+            draft.blame("numerics.tolerance", "the flow has no rate; give dt in s instead")
+    for index, group in enumerate(draft.fibers):
+        if draft.is_given(f"fibers.{index}.initial_velocity"):
+            draft.note(f"fibers.{index}.initial_velocity has no effect in method overdamped")
+        if draft.gravity is not None and group["density"] is None:
+            draft.faults.add(
+                f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
+            )
 
 
 def _check_flow(draft: Draft) -> None:
@@ -207,7 +244,7 @@ def _check_stages(draft: Draft) -> None:
 
 def _check_rest(draft: Draft) -> None:
     """Without a rate the strain never grows, so nothing can wait for it."""
-    still = draft.flow is None and draft.method != "bead_chain"
+    still = draft.flow is None and draft.method not in DRAGGED
     if draft.flow_object is not None:
         still = draft.flow_object.kind == "rest"
     if not still:

@@ -30,7 +30,7 @@ def effective_stiffness(scene: Scene, group: FiberGroup) -> float | None:
 
 def reynolds_number(scene: Scene, group: FiberGroup) -> float | None:
     """Re = rho a^2 rate/eta of a bead: its inertia against the drag on it."""
-    if scene.flow is None or scene.flow.rate == 0.0:
+    if scene.flow is None or scene.flow.rate == 0.0 or group.density is None:
         return None
     return group.density * group.radius**2 * scene.flow.rate / scene.flow.viscosity
 

@@ -322,7 +322,12 @@ NUMERICS = Table(
             default="end_weighted",
             methods=("bead_chain", "overdamped"),
         ),
-        Key("integrator", Choice(("sdirk2", "bdf2")), methods=("overdamped",)),
+        Key(
+            "integrator",
+            Choice(("sdirk2", "bdf2")),
+            methods=("overdamped",),
+            method_default=(("overdamped", "sdirk2"),),
+        ),
         Key(
             "contact",
             Choice(("penalty", "unilateral")),

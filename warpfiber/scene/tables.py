@@ -105,8 +105,8 @@ class FiberGroup:
 
     diameter: float
     """m"""
-    density: float
-    """kg/m^3"""
+    density: float | None = None
+    """kg/m^3; None where nothing has inertia or weight"""
     youngs_modulus: float
     """Pa"""
     axial_modulus: float

@@ -1,0 +1,202 @@
+"""What every method shares: flow, workers, queued steps, and what is said of a torn fiber.
+
+A method owns the arrays that only it needs, and advances a State by `launches`. `list` and `skin`
+are None where no pairs are searched for.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.methods.skin import SkinChoice
+from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
+from warpfiber.passes.executor import Call, Executor, Launch, load_kernels
+from warpfiber.passes.measure import TERMS
+from warpfiber.passes.measurement import measure_fiber_terms
+from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.nodes import TEAR_STRETCH
+from warpfiber.passes.pairs import PairFeatures
+from warpfiber.scene import Scene
+
+# Below this many segments the hand-off between workers costs more than it saves.
+WORKER_BREAK_EVEN = 5000
+
+
+class Method:
+    """Advances a State by steps of `dt` (run units)."""
+
+    inertia = True  # nodes have a mass, and so a kinetic energy
+
+    def __init__(
+        self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
+    ) -> None:
+        self.scene, self.model, self.state = scene, model, state
+        self.dt = dt / model.units.time
+        self.workers = self._choose_workers(workers)
+        units = model.units
+        self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
+        self.flow_origin = np.zeros(3)
+        if scene.flow is not None and scene.flow.origin is not None:
+            self.flow_origin = np.asarray(scene.flow.origin) / units.length
+        self.strength = self.decay = 0.0  # of the repulsion
+        self.pair_features = PairFeatures()
+        self.list: NeighborList | None = None
+        self.skin: SkinChoice | None = None
+        self.list_seconds = 0.0
+        self.strain_end = math.inf  # where a deforming box becomes too flat
+        self.set_gradient()
+        self.executor: Executor | None = None
+        self._status_view: np.ndarray | None = None
+        self.pair_acts = wp.zeros(0, dtype=wp.uint8, device=model.device)
+        self.pair_force = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
+
+    def launches(self) -> list[Launch | Call]:
+        """The launches of one step."""
+        raise NotImplementedError
+
+    def _choose_workers(self, workers: int | None) -> int:
+        if not self.model.device.startswith("cpu"):
+            return 1
+        if workers is not None:
+            return workers
+        if self.model.segment_count < WORKER_BREAK_EVEN:
+            return 1
+        try:
+            cores = len(os.sched_getaffinity(0))
+        except AttributeError:  # only Linux tells which cores this process may use
+            cores = os.cpu_count() or 1
+        return min(2, cores)
+
+    def set_gradient(self) -> None:
+        """The flow's gradient at the present strain, before the first step sets it."""
+        p, scene = self.model.precision, self.scene
+        full = np.zeros((3, 3))
+        if scene.flow is not None and scene.flow.velocity_gradient is not None:
+            full = np.asarray(scene.flow.velocity_gradient) * self.model.units.time
+        self.full_gradient = full
+        schedule = scene.flow.schedule if scene.flow and scene.flow.schedule else ((0.0, 1.0),)
+        self.schedule = np.asarray(schedule, dtype=np.float64)
+        strain = float(self.state.strain.numpy()[0])
+        factor = scene.flow.factor(strain) if scene.flow else 1.0
+        self.state.gradient.assign((full * factor)[None].astype(p.numpy))
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    def prepare(self, measuring: Iterable[Any] = ()) -> None:
+        """Compile and capture, so that the next `advance` only steps.
+
+        `measuring`: further kernels of the run, compiled along with these.
+        """
+        if self.executor is None:
+            launches = self.launches()
+            stepping = [launch.kernel for launch in launches if isinstance(launch, Launch)]
+            load_kernels([*stepping, *measuring], self.model.device)
+            self.executor = Executor(launches, self.model.device, self.workers)
+
+    def advance(self, steps: int) -> bool:
+        """Run up to `steps` steps, doing what halts them; False if a fiber tore."""
+        target = self.step_count + steps
+        while self.step_count < target:
+            self.prepare()
+            assert self.executor is not None
+            self.executor.run(target - self.step_count, self._halted)
+            if not self._settle():
+                return False
+        return True
+
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """Seconds per step of every launch, over `steps` steps of the run."""
+        self.prepare()
+        assert self.executor is not None
+        times = self.executor.time_launches(steps, self._halted)
+        self._settle()  # a torn fiber is left to the next `advance`
+        return times
+
+    def _settle(self) -> bool:
+        """Do what halted the steps asks for; False if a fiber tore."""
+        return not self._status()[TORN]
+
+    def _halted(self) -> bool:
+        status = self._status()
+        return bool(status[EXPIRED] or status[TORN] or status[STRETCHED])
+
+    def _status(self) -> np.ndarray:
+        """The status words: on the CPU a view that is made once, looked at after every graph."""
+        if self._status_view is None or not self.model.device.startswith("cpu"):
+            self._status_view = self.state.status.numpy()
+        return self._status_view
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken."""
+        return int(self.state.step.numpy()[0])
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have, run units."""
+        return 0.0
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        self._stop_executor()
+
+    def _stop_executor(self) -> None:
+        if self.executor is not None:
+            self.executor.close()
+            self.executor = None
+
+    # -- what is saved and told -------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next step depends on beside the State, in run units."""
+        return {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take over what `saved` returned; the State has been restored."""
+
+    def list_report(self) -> dict[str, float]:
+        """What the search for pairs did; nothing without a list."""
+        return {}
+
+    def step_report(self) -> dict[str, float]:
+        """What the choice of the step did; nothing where it never changes."""
+        return {}
+
+    def _segment_stretch(self) -> np.ndarray:
+        """(S,) length of every segment now, in its rest length."""
+        model = self.model
+        nodes = self.state.node_pos.numpy().astype(float)
+        first = model.host["segment_node"]
+        rest = np.asarray([row["rest"] for row in model.group_rows])
+        mine = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
+        lengths: np.ndarray = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine
+        return lengths
+
+    def torn_fiber(self) -> dict[str, Any]:
+        """First torn fiber, its worst node, and its largest force term (N) after `advance`."""
+        model, state = self.model, self.state
+        stretch = self._segment_stretch()
+        bad = np.flatnonzero(~(stretch < TEAR_STRETCH))
+        fiber = int(state.status.numpy()[BAD_FIBER])
+        if len(bad):  # several may have torn in one step, in any order
+            fiber = int(model.host["segment_fiber"][bad[0]])
+        sizes = measure_fiber_terms(
+            model, state, fiber, self.flow_origin, self.list, self.pair_acts, self.pair_force
+        )
+        mine = stretch[model.host["segment_fiber"] == fiber]
+        worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))
+        known = np.isfinite(sizes).any()
+        largest = int(np.argmax(np.where(np.isfinite(sizes), sizes, -1.0 if known else 0.0)))
+        return {
+            "fiber": fiber,
+            "node": worst,
+            "terms": dict(zip(TERMS, map(float, sizes), strict=True)),
+            "largest_term": TERMS[largest],
+            "stretch": float(mine[worst]),
+        }
