@@ -11,13 +11,14 @@ Limits: nothing may be launched from another thread during a capture (Warp's rec
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
+
+from warpfiber.passes.workers import Workers, wait_kernel
 
 BATCH = 16  # steps per graph where looking after every step would cost more than it saves
 BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
@@ -92,7 +93,7 @@ class Executor:
         load_kernels((x.kernel for x in self.launches if isinstance(x, Launch)), device)
         items = sum(launch.dim for launch in self.launches)
         self.batches = items < BATCH_BELOW or not device.startswith("cpu")
-        self._pool: _Workers | None = None
+        self._pool: Workers | None = None
         if self.workers > 1:
             groups: list[list[Launch | Call]] = []
             for launch in self.launches:
@@ -101,7 +102,8 @@ class Executor:
                 else:
                     groups.append([launch])
             phases = [self._capture_phase(group) for group in groups]
-            self._pool = _Workers(phases, self.workers)
+            load_kernels([wait_kernel()], device)
+            self._pool = Workers(phases, self.workers)
         else:
             self._single = self._capture_steps(1)
             self._batch: Any = None
@@ -172,56 +174,3 @@ class Executor:
         if self._pool is not None:
             self._pool.close()
             self._pool = None
-
-
-class _Workers:
-    """Persistent threads that replay their own graph of a phase when told to; the caller is worker
-    0.
-    """
-
-    def __init__(self, phases: list[list[Any]], workers: int) -> None:
-        self.phases = phases
-        self.go = [threading.Lock() for _ in range(workers - 1)]
-        self.done = [threading.Lock() for _ in range(workers - 1)]
-        self.phase: list[Any] | None = None
-        self.threads = []
-        for lock in (*self.go, *self.done):
-            lock.acquire()
-        for worker in range(1, workers):
-            thread = threading.Thread(target=self._work, args=(worker,), daemon=True)
-            thread.start()
-            self.threads.append(thread)
-
-    def _work(self, worker: int) -> None:
-        go, done = self.go[worker - 1], self.done[worker - 1]
-        while True:
-            go.acquire()
-            if self.phase is None:
-                return
-            graph = self.phase[worker]
-            if graph is not None:
-                wp.capture_launch(graph)
-            done.release()
-
-    def run(self, steps: int, halted: Callable[[], bool]) -> None:
-        for _ in range(steps):
-            if halted():
-                return
-            for phase in self.phases:
-                if all(graph is None for graph in phase[1:]):
-                    wp.capture_launch(phase[0])
-                    continue
-                self.phase = phase
-                for lock in self.go:
-                    lock.release()
-                if phase[0] is not None:  # fewer items than workers: the last ones have them
-                    wp.capture_launch(phase[0])
-                for lock in self.done:
-                    lock.acquire()
-
-    def close(self) -> None:
-        self.phase = None
-        for lock in self.go:
-            lock.release()
-        for thread in self.threads:
-            thread.join()
