@@ -1,6 +1,6 @@
 """Figs. 6-9 of Sasayama & Inagaki 2018: reduced against full chains in the same sheared cells.
 
-Run with `tools/test -m slow` (two hours); `tools/bench.py suspensions` writes such runs of
+Run with `tools/test -m slow` (an hour and a half); `tools/bench.py suspensions` writes such runs of
 all cells to the benchmark record, with their curves.
 """
 
