@@ -60,7 +60,7 @@ def choose_device(scene: Scene, segments: int) -> str:
     raise SceneError([Fault(scene.path, "numerics.device", wanted, remedy)])
 
 
-def check_step(scene: Scene) -> tuple[float, list[StepLimit]]:
+def check_step(scene: Scene) -> tuple[float, tuple[StepLimit, ...]]:
     """Chosen dt in s and all limits; raises SceneError if dt is above the smallest limit."""
     limits, dt = step_limits(scene), chosen_step(scene)
     smallest = limits[0]

@@ -22,7 +22,7 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
 from warpfiber.model import EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
-from warpfiber.passes.executor import Call, Launch, load_kernels
+from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
@@ -185,13 +185,11 @@ class BeadChain(Method):
 
         `measuring`: further kernels of the run, compiled along with these.
         """
-        if self.executor is None:
-            stepping = [launch.kernel for launch in step_launches(self)]
-            listing = self.list.kernels.values() if self.list is not None else ()
-            load_kernels([*stepping, *listing, *measuring], self.model.device)
+        listing = self.list.kernels.values() if self.list is not None else ()
+        super().prepare([*listing, *measuring])
         if self.list is not None and self.list.build_count == 0:
             self.refresh_list()
-        super().prepare()
+            super().prepare()  # a list that grew has other arrays
 
     def _settle(self) -> bool:
         """Do what halted the steps asks for, so that nothing is pending; False if a fiber tore."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -28,7 +29,7 @@ from warpfiber.scene import Scene
 WORKER_BREAK_EVEN = 5000
 
 
-class Method:
+class Method(ABC):
     """Advances a State by steps of `dt` (run units)."""
 
     inertia = True  # nodes have a mass, and so a kinetic energy
@@ -56,9 +57,9 @@ class Method:
         self.pair_acts = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.pair_force = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
 
+    @abstractmethod
     def launches(self) -> list[Launch | Call]:
         """The launches of one step."""
-        raise NotImplementedError
 
     def _choose_workers(self, workers: int | None) -> int:
         if not self.model.device.startswith("cpu"):
@@ -153,10 +154,11 @@ class Method:
 
     # -- what is saved and told -------------------------------------------------------------------
 
+    @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:
         """What the next step depends on beside the State, in run units."""
-        return {}
 
+    @abstractmethod
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned; the State has been restored."""
 

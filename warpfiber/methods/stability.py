@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -152,13 +153,14 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     return limits
 
 
-def step_limits(scene: Scene) -> list[StepLimit]:
+@lru_cache(maxsize=4)
+def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
     """All limits of all groups, smallest first; `overdamped` has none but the strain of a step."""
     if scene.numerics.method == "overdamped":
         dt = largest_step(scene)
-        return [StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0, "accurate")]
+        return (StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0, "accurate"),)
     limits = [limit for i in range(len(scene.fibers)) for limit in _group_limits(scene, i)]
-    return sorted(limits, key=lambda limit: limit.dt)
+    return tuple(sorted(limits, key=lambda limit: limit.dt))
 
 
 def chosen_step(scene: Scene) -> float:
