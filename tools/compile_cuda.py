@@ -169,6 +169,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         yield "clock_step", variant, make_clock(precision, sheared, scheduled)
     yield "step_begin", "", make_step_begin(precision)
     yield "chain_step", "", make_chain_step(precision)
+    yield "chain_step", "loads", make_chain_step(precision, True, True)
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     for variant, adaptive in (("plain", False), ("tolerance", True)):

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.loads import node_loads
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import Model, State
@@ -60,6 +61,9 @@ class Overdamped(Method):
         self.row_stride = -most if device.startswith("cpu") else most
         row = elimination_row(p.name)
         self.rows = wp.empty(most * model.fiber_count, dtype=row, device=device)
+        hold, load = node_loads(scene, model)
+        self.node_hold = wp.array(hold, dtype=wp.uint8, device=device)
+        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
         chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
         self.error = wp.zeros(chunks, dtype=wp.float64, device=device)
@@ -138,9 +142,15 @@ class Overdamped(Method):
             self.node_back,
             self.velocity_back,
             self.fiber_error,
+            self.node_hold,
+            self.node_load,
+            state.fiber_image,
+            state.lattice,
             state.status,
         ]
-        return Launch("fibers", make_chain_step(p.name), model.fiber_count, inputs, split=True)
+        loaded = self.node_hold.shape[0] > 0
+        kernel = make_chain_step(p.name, loaded, loaded and model.domain.sheared)
+        return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
 
     def _end(self) -> Launch:
         model, state = self.model, self.state
