@@ -39,8 +39,8 @@ CHI = 1.0 - 1.0 / math.sqrt(2.0)
 def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
     """Kernel `chain_step`: one step of BDF2 (`stages` 1) or SDIRK2 (2) of every fiber.
 
-    `loaded`: nodes have a force or, where `node_hold` says so, a velocity in `node_load`; of those
-    that are held in a box that is `sheared` with the flow, the stored images move with the flow.
+    `loaded`: nodes have a force or, where `node_hold` says so, a velocity in `node_load`, and frozen
+    fibers are left to `carry_fibers`; `sheared`: stored images move with the flow.
 
     `keeps`: steps may be rejected, so the state of the start is kept and a tear left to the error.
     `row_stride`: rows per fiber in `rows`; negative if all fibers of a launch share the first's.
@@ -53,7 +53,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
     torque_couple = make_torque(name)
     drag_diagonal, bending_entries, turning_resistance = make_chain_terms(name)
     sym_mul, block_inverse = make_sym_algebra(name)
-    held_velocity, carry_fiber, held_impulse = make_held(name, sheared, CHI)
+    held_velocity, held_impulse = make_held(name, sheared)
     zero, one, two = real(0.0), real(1.0), real(2.0)
     tear, endless = real(TEAR_STRETCH), real(1.0e30)
     chi, inverse_chi, two_thirds = real(CHI), real(1.0 / CHI), real(2.0 / 3.0)
@@ -98,25 +98,6 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
             base = row_stride * fiber
         if wp.static(loaded):
             if wp.int32(node_hold[first]) == wp.static(FROZEN):
-                carry_fiber(
-                    first,
-                    first + segments,
-                    keeps,
-                    dt,
-                    node_load[first],
-                    stage_gradient,
-                    lattice[0],
-                    fiber_image[fiber],
-                    node_pos,
-                    node_velocity,
-                    node_motion,
-                    node_back,
-                    velocity_back,
-                )
-                fiber_error[fiber] = zero
-                if row_stride > 0:
-                    for k in range(segments + 1):
-                        rows[base + k] = Row()  # a fiber that no force moves
                 return
         drag_end = g.drag * drag_diagonal(g.spacing, 0, segments)
         drag_inner = g.drag * drag_diagonal(g.spacing, 1, 2)
@@ -301,13 +282,10 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                 vt = wp.dot(q, y) + yt * s
                 if wp.static(loaded):
                     if wp.int32(node_hold[i]) != wp.static(FREE):
-                        time = dt
-                        if from_velocity:
-                            time = h
-                        v = -w0
-                        v += h * held_velocity(
-                            node_load[i], gradient, lattice[0], fiber_image[fiber], time
-                        )
+                        time = wp.where(from_velocity, h, dt)
+                        image = fiber_image[fiber]
+                        V = held_velocity(node_load[i], gradient, lattice[0], image, time)
+                        v = h * V - w0
                         pd = nothing
                         po = nothing
                         q = nothing

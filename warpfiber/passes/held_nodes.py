@@ -10,17 +10,18 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.model import precision
+from warpfiber.model import HALT, precision
+from warpfiber.passes.elimination import elimination_row
 
 FREE, HELD, FROZEN = range(3)  # what `node_hold` says of a node
 
 
 @cache
-def make_held(name: str, sheared: bool, chi: float):
-    """`held_velocity` of one node at a stage and `carry_fiber` of all of them over a step."""
+def make_held(name: str, sheared: bool):
+    """`held_velocity` of a stored image and `held_impulse`, what is left of a held node's block."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
-    early, late, zero, one = real(chi), real(1.0 - chi), real(0.0), real(1.0)
+    zero, one = real(0.0), real(1.0)
 
     @wp.func
     def held_velocity(
@@ -35,28 +36,61 @@ def make_held(name: str, sheared: bool, chi: float):
         return given
 
     @wp.func
-    def carry_fiber(
-        first: wp.int32,
-        last: wp.int32,
+    def held_impulse(slack: real) -> real:
+        """Inverse pivot of the impulse behind a held node; 0 between two that keep their length."""
+        if slack > zero:
+            return -one / slack
+        return zero
+
+    return held_velocity, held_impulse
+
+
+@cache
+def make_carry_fibers(name: str, sheared: bool, chi: float):
+    """Kernel `carry_fibers`: every frozen fiber by dt ((1 - chi) V_1 + chi V_2), V at the stages.
+
+    `row_stride` > 0: rows of the elimination that are looked at after it, of what no force moves.
+    """
+    p = precision(name)
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    Row = elimination_row(name)
+    held_velocity, _ = make_held(name, sheared)
+    early, late = real(chi), real(1.0 - chi)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def carry_fibers(
+        offset: wp.int32,
         keeps: wp.int32,
-        dt: real,
-        given: vec3,
+        row_stride: wp.int32,
+        step_size: wp.array(dtype=wp.float64),
         stage_gradient: wp.array(dtype=mat33),
-        lattice: wp.mat33d,
-        image: wp.vec3i,
+        fiber_node_start: wp.array(dtype=wp.int32),
+        node_hold: wp.array(dtype=wp.uint8),
+        node_load: wp.array(dtype=vec3),
+        fiber_image: wp.array(dtype=wp.vec3i),
+        lattice: wp.array(dtype=wp.mat33d),
+        rows: wp.array(dtype=Row),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         node_motion: wp.array(dtype=vec3),
         node_back: wp.array(dtype=vec3),
         velocity_back: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
     ):
-        """All nodes by dt ((1 - chi) V_1 + chi V_2), the end of both stages of SDIRK2."""
-        end = held_velocity(given, stage_gradient[1], lattice, image, dt)
+        if status[wp.static(HALT)] != 0:
+            return
+        fiber = wp.tid() + offset
+        first = fiber_node_start[fiber]
+        if wp.int32(node_hold[first]) != wp.static(FROZEN):
+            return
+        given, image = node_load[first], fiber_image[fiber]
+        dt = real(step_size[0])
+        end = held_velocity(given, stage_gradient[1], lattice[0], image, dt)
         move = dt * end
         if wp.static(sheared):
-            begin = held_velocity(given, stage_gradient[0], lattice, image, early * dt)
+            begin = held_velocity(given, stage_gradient[0], lattice[0], image, early * dt)
             move = dt * (late * begin + early * end)
-        for i in range(first, last + 1):
+        for i in range(first, fiber_node_start[fiber + 1]):
             x = node_pos[i]
             if keeps != 0:
                 node_back[i] = x
@@ -64,12 +98,7 @@ def make_held(name: str, sheared: bool, chi: float):
             node_pos[i] = x + move
             node_velocity[i] = end
             node_motion[i] = move
+            if row_stride > 0:
+                rows[row_stride * fiber + i - first] = Row()
 
-    @wp.func
-    def held_impulse(slack: real) -> real:
-        """Inverse pivot of the impulse behind a held node; 0 between two that keep their length."""
-        if slack > zero:
-            return -one / slack
-        return zero
-
-    return held_velocity, carry_fiber, held_impulse
+    return carry_fibers
