@@ -132,7 +132,7 @@ def _cell(
 
 
 def _tips(simulation: wf.Simulation, strains: tuple[int, ...]) -> tuple[dict[int, float], float]:
-    """z/L of the last node at the strains, and the seconds of all steps, the warm ones as others."""
+    """z/L of the last node at the strains; seconds of all steps, the warm ones as the others."""
     flow, length = simulation.scene.flow, simulation.scene.fibers[0].centerline_length
     tips, seconds = {}, 0.0
     simulation.step(WARM_STEPS)
