@@ -66,6 +66,9 @@ class Overdamped(Method):
         self.error_fiber = wp.zeros(chunks, dtype=wp.int32, device=device)
         self.stage_gradient = wp.zeros(2, dtype=p.mat33, device=device)
         self.strain_next = wp.zeros(1, dtype=wp.float64, device=device)
+        self.ends_lattice = wp.zeros(2, dtype=p.mat33, device=device)  # of the step under way
+        self.deformation_next = wp.zeros(1, dtype=wp.mat33d, device=device)
+        self.verdict = wp.zeros(2, dtype=wp.int32, device=device)
         self.rejected = wp.zeros(2, dtype=wp.int32, device=device)  # the last step, and in all
         first = step_start(scene) / model.units.time if self.adaptive else self.dt
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
@@ -97,7 +100,6 @@ class Overdamped(Method):
                 state.node_pos,
                 state.node_velocity,
                 self.tension,
-                state.status,
             ]
             back = make_take_back(name)
             steps.append(Launch("take_back", back, model.fiber_count, inputs, split=True))
@@ -111,11 +113,17 @@ class Overdamped(Method):
             self._schedule(),
             self.step_size,
             state.strain,
+            state.lattice,
+            state.deformation,
             state.status,
+            self.rejected,
             self.strain_next,
             self.stage_gradient,
+            self.ends_lattice,
+            self.deformation_next,
         ]
-        return Launch("begin", make_step_begin(self.model.precision.name), 1, inputs)
+        begin = make_step_begin(self.model.precision.name, self.model.domain.sheared)
+        return Launch("begin", begin, 1, inputs)
 
     def _solve(self, stages: int) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
@@ -153,6 +161,7 @@ class Overdamped(Method):
             wp.float64(self.dt),
             self.error,
             self.error_fiber,
+            self.verdict,
             self.strain_next,
             self.step_size,
             self.rejected,
