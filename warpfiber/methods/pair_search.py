@@ -76,7 +76,8 @@ class PairSearch:
         """What a lasting box has room for; a box that is flattened keeps the start skin."""
         room = lasting_height(self.scene) / self.model.units.length
         room -= self.list.cell_width - self.list.skin
-        return max(start, min(2.0 * MOST_SKIN * self.radius, room * (1.0 - 1e-9)))
+        most: float = min(2.0 * MOST_SKIN * self.radius, room * (1.0 - 1e-9))
+        return max(start, most)
 
     def bearable_strain(self) -> float:
         """Strain that the box can bear; raises SceneError if it is too small from the start."""
