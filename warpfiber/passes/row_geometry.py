@@ -165,6 +165,82 @@ def make_row_geometry(name: str):
         return is_same(st, vec2(zero, t), wp.length(edge), wp.length(other), arc)
 
     @wp.func
+    def is_counted_i(
+        slot: wp.int32,
+        place: vec2,
+        has_first: wp.bool,
+        st: vec2,
+        delta: vec3,
+        a: vec3,
+        b: vec3,
+        c: vec3,
+        arc: real,
+        node_i: wp.int32,
+        at_i: wp.int32,
+        segments_i: wp.int32,
+        node_j: wp.int32,
+        at_j: wp.int32,
+        segments_j: wp.int32,
+        nodes: wp.array(dtype=vec3),
+    ) -> wp.bool:
+        """Whether the row of a node of i is made, and here."""
+        if slot == 2 and at_i > 0:
+            return False
+        if has_first and is_same(place, st, wp.length(a), wp.length(b), arc):
+            return False
+        if not is_nearest(place[1], c, b, arc, node_j, at_j, segments_j, nodes):
+            return False
+        if slot == 1 and at_i < segments_i - 1:
+            edge = nodes[node_i + 2] - nodes[node_i + 1]
+            if is_beside_next(
+                delta - a, edge, b, at_i + 1, segments_i, at_j, segments_j, place[1], arc
+            ):
+                return False
+        return True
+
+    @wp.func
+    def is_counted_j(
+        slot: wp.int32,
+        place: vec2,
+        has_first: wp.bool,
+        st: vec2,
+        delta: vec3,
+        a: vec3,
+        b: vec3,
+        c: vec3,
+        arc: real,
+        node_i: wp.int32,
+        at_i: wp.int32,
+        segments_i: wp.int32,
+        node_j: wp.int32,
+        at_j: wp.int32,
+        segments_j: wp.int32,
+        nodes: wp.array(dtype=vec3),
+    ) -> wp.bool:
+        """Whether the row of a node of j is made, and here; the nodes of i come first."""
+        if slot == 4 and at_j > 0:
+            return False
+        length_a = wp.length(a)
+        length_b = wp.length(b)
+        if has_first and is_same(place, st, length_a, length_b, arc):
+            return False
+        for end in range(1, 3):
+            other = row_fractions(end, delta, a, b)
+            if is_same(place, other, length_a, length_b, arc):
+                # made by whichever segment owns the node, unless the closest points stand for it
+                if not (has_first and is_same(other, st, length_a, length_b, arc)):
+                    return False
+        if not is_nearest(place[0], -c, a, arc, node_i, at_i, segments_i, nodes):
+            return False
+        if slot == 3 and at_j < segments_j - 1:
+            edge = nodes[node_j + 2] - nodes[node_j + 1]
+            if is_beside_next(
+                -(delta + b), edge, a, at_j + 1, segments_j, at_i, segments_i, place[0], arc
+            ):
+                return False
+        return True
+
+    @wp.func
     def kept_slots(
         st: vec2,
         delta: vec3,
@@ -175,6 +251,7 @@ def make_row_geometry(name: str):
         wb: vec3,
         contact: real,
         keep: real,
+        far: real,
         arc: real,
         node_i: wp.int32,
         at_i: wp.int32,
@@ -186,69 +263,65 @@ def make_row_geometry(name: str):
     ) -> wp.int32:
         """One bit per slot whose row counts and has a predicted gap below `keep`; st: slot 0."""
         slots = wp.int32(0)
-        length_a = wp.length(a)
-        length_b = wp.length(b)
         # closest points at a joint are those of a node, which its owner reports
         has_first = not (is_joint(st[0], at_i, segments_i) or is_joint(st[1], at_j, segments_j))
         if has_first:
             if predicted_gap(st, delta, a, b, w, wa, wb, contact) < keep:
                 slots = 1
-        last_i = row_fractions(1, delta, a, b)
-        first_i = row_fractions(2, delta, a, b)
-        has_last_i = not (has_first and is_same(last_i, st, length_a, length_b, arc))
-        has_first_i = not (has_first and is_same(first_i, st, length_a, length_b, arc))
+        inverse_aa = one / wp.dot(a, a)
+        inverse_bb = one / wp.dot(b, b)
         for slot in range(1, 5):
-            place = row_fractions(slot, delta, a, b)
-            if predicted_gap(place, delta, a, b, w, wa, wb, contact) < keep:
-                c = delta + place[1] * b - place[0] * a
-                counts = wp.bool(True)
-                if slot <= 2:
-                    counts = slot == 1 or at_i == 0
-                    if counts:
-                        counts = is_nearest(place[1], c, b, arc, node_j, at_j, segments_j, nodes)
-                    if slot == 1:
-                        counts = counts and has_last_i
-                        if counts and at_i < segments_i - 1:
-                            edge = nodes[node_i + 2] - nodes[node_i + 1]
-                            counts = not is_beside_next(
-                                delta - a,
-                                edge,
-                                b,
-                                at_i + 1,
-                                segments_i,
-                                at_j,
-                                segments_j,
-                                place[1],
-                                arc,
-                            )
-                    else:
-                        counts = counts and has_first_i
-                else:
-                    counts = slot == 3 or at_j == 0
-                    if has_first and is_same(place, st, length_a, length_b, arc):
-                        counts = False
-                    # the nodes of i come first, whichever segment reports them
-                    if has_last_i and is_same(place, last_i, length_a, length_b, arc):
-                        counts = False
-                    if has_first_i and is_same(place, first_i, length_a, length_b, arc):
-                        counts = False
-                    if counts:
-                        counts = is_nearest(place[0], -c, a, arc, node_i, at_i, segments_i, nodes)
-                    if counts and slot == 3 and at_j < segments_j - 1:
-                        edge = nodes[node_j + 2] - nodes[node_j + 1]
-                        counts = not is_beside_next(
-                            -(delta + b),
-                            edge,
+            place = vec2(real(2 - slot), real(4 - slot))
+            if slot <= 2:
+                c0 = delta - place[0] * a
+                place[1] = wp.clamp(-wp.dot(c0, b) * inverse_bb, zero, one)
+            else:
+                c0 = delta + place[1] * b
+                place[0] = wp.clamp(wp.dot(c0, a) * inverse_aa, zero, one)
+            c = delta + place[1] * b - place[0] * a
+            # most ends are far from the other fiber
+            if wp.length_sq(c) < far * far:
+                if predicted_gap(place, delta, a, b, w, wa, wb, contact) < keep:
+                    if slot <= 2:
+                        counts = is_counted_i(
+                            slot,
+                            place,
+                            has_first,
+                            st,
+                            delta,
                             a,
-                            at_j + 1,
-                            segments_j,
+                            b,
+                            c,
+                            arc,
+                            node_i,
                             at_i,
                             segments_i,
-                            place[0],
-                            arc,
+                            node_j,
+                            at_j,
+                            segments_j,
+                            nodes,
                         )
-                if counts:
-                    slots |= 1 << slot
+                    else:
+                        counts = is_counted_j(
+                            slot,
+                            place,
+                            has_first,
+                            st,
+                            delta,
+                            a,
+                            b,
+                            c,
+                            arc,
+                            node_i,
+                            at_i,
+                            segments_i,
+                            node_j,
+                            at_j,
+                            segments_j,
+                            nodes,
+                        )
+                    if counts:
+                        slots |= 1 << slot
         return slots
 
     return largest_motion, row_fractions, row_normal_gap, kept_slots
