@@ -268,6 +268,7 @@ def make_chain_step(name: str):
                 row.diagonal = pd
                 row.off = po
                 row.q = q
+                row.s = s
                 row.l0 = l0
                 row.l1 = l1
                 row.l2 = l2
