@@ -1,4 +1,4 @@
-"""Methods `rigid_rod` and `auto` from outside: what is chosen and why, what `check` and `run` say."""
+"""Methods `rigid_rod` and `auto` from outside: what is chosen and why, what is said of it."""
 
 from __future__ import annotations
 
@@ -73,6 +73,7 @@ CHOICES: list[tuple[dict[str, object], str, str]] = [
     ({"flow__schedule": [[0.0, 1.0], [2.0, 50.0]]}, "overdamped", "may buckle"),
     ({"numerics__closure": "paper"}, "bead_chain", 'cannot run numerics.closure = "paper"'),
     ({"fibers__0__initial_velocity": "rest"}, "bead_chain", "asks for inertia"),
+    ({"fibers__0__frozen": True}, "overdamped", "rigid_rod cannot run fibers.0.frozen"),
     ({"contact__law": "exponential"}, "bead_chain", 'overdamped cannot run contact.law = "exp'),
 ]
 

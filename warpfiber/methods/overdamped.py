@@ -1,7 +1,7 @@
 """Fibers without inertia: linearly implicit SDIRK2 or BDF2, one banded solve per fiber and stage.
 
-A step: begin (flow at the stages), fibers (`chain_solve`), end (time, flow, and with a tolerance
-the acceptance and the size of the next step). The tension is carried from step to step.
+A step: begin (flow at the stages), fibers (`chain_solve`), frozen fibers, end (time, flow, and with
+a tolerance the acceptance and the size of the next step). The tension is carried from step to step.
 Source: Galerkin drag of the beads, hydrodynamic torque, stretching in compliance form (modulus, or
     segments that keep their length), bending of straight rest shapes; SDIRK2 and its embedded
     first-order error estimate, BDF2 started by one SDIRK2 step.
@@ -16,12 +16,14 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.loads import node_loads
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import Model, State
-from warpfiber.passes.chain_solve import make_chain_step
+from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.step_control import (
     ERROR_CHUNKS,
     make_largest_error,
@@ -60,6 +62,9 @@ class Overdamped(Method):
         self.row_stride = -most if device.startswith("cpu") else most
         row = elimination_row(p.name)
         self.rows = wp.empty(most * model.fiber_count, dtype=row, device=device)
+        hold, load = node_loads(scene, model)
+        self.node_hold = wp.array(hold, dtype=wp.uint8, device=device)
+        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
         chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
         self.error = wp.zeros(chunks, dtype=wp.float64, device=device)
@@ -85,6 +90,8 @@ class Overdamped(Method):
         model, state = self.model, self.state
         name = model.precision.name
         steps: list[Launch | Call] = [self._begin(), self._solve(stages)]
+        if any(group.frozen for group in self.scene.fibers):
+            steps.append(self._carry())
         if self.adaptive:
             chunks = self.error.shape[0]
             errors = [chunks, self.fiber_error, self.error, self.error_fiber]
@@ -146,9 +153,38 @@ class Overdamped(Method):
             self.node_back,
             self.velocity_back,
             self.fiber_error,
+            self.node_hold,
+            self.node_load,
+            state.fiber_image,
+            state.lattice,
             state.status,
         ]
-        return Launch("fibers", make_chain_step(p.name), model.fiber_count, inputs, split=True)
+        loaded = self.node_hold.shape[0] > 0
+        kernel = make_chain_step(p.name, loaded, loaded and model.domain.sheared)
+        return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
+
+    def _carry(self) -> Launch:
+        model, state = self.model, self.state
+        inputs = [
+            1 if self.adaptive else 0,
+            self.row_stride,
+            self.step_size,
+            self.stage_gradient,
+            model.fiber_node_start,
+            self.node_hold,
+            self.node_load,
+            state.fiber_image,
+            state.lattice,
+            self.rows,
+            state.node_pos,
+            state.node_velocity,
+            self.node_motion,
+            self.node_back,
+            self.velocity_back,
+            state.status,
+        ]
+        kernel = make_carry_fibers(model.precision.name, model.domain.sheared, CHI)
+        return Launch("frozen", kernel, model.fiber_count, inputs, split=True)
 
     def _end(self) -> Launch:
         model, state = self.model, self.state

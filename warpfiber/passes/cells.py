@@ -51,7 +51,9 @@ FETCH_AHEAD = r"""
 
 
 @cache
-def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
+def make_cell_kernels(
+    name: str, features: ListFeatures, native: bool = False, module: str = "unique"
+):
     """`place_fibers`, `start_list`, `bin_pieces`, `gather_pieces` as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -62,7 +64,7 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
     sheared = features.sheared
     pieces = features.pieces
     half = wp.float64(0.5)
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func
     def wrap_count(x: wp.vec3d) -> wp.vec3i:

@@ -47,14 +47,14 @@ def make_flow_history():
 
 
 @cache
-def make_clock(name: str, sheared: bool, scheduled: bool):
+def make_clock(name: str, sheared: bool, scheduled: bool, module: str = "unique"):
     """Kernel `clock_step` (one thread)."""
     p = precision(name)
     mat33 = p.mat33
 
     rate_factor, lattice_push = make_flow_history()
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clock_step(
         dt: wp.float64,
         rate: wp.float64,

@@ -37,6 +37,7 @@ from warpfiber.passes.cells import (
     make_cell_kernels,
 )
 from warpfiber.passes.executor import Executor
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_launches import list_launches
 from warpfiber.passes.native_search import make_search_kernels
 from warpfiber.passes.native_sort import make_sort_kernels
@@ -87,12 +88,13 @@ class NeighborList:
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
         features = ListFeatures(domain.periodic, domain.shear_axes, domain.sheared, has_pieces)
-        self.kernels = dict(make_cell_kernels(name, features, self.native))  # cached: copy
         if self.native:
-            self.kernels |= make_search_kernels(name, domain.periodic, has_pieces)
-            self.kernels |= make_sort_kernels()
+            module = kernel_module("list", name, features)
+            self.kernels = make_cell_kernels(name, features, True, module)
+            self.kernels |= make_search_kernels(name, domain.periodic, has_pieces, module)
+            self.kernels |= make_sort_kernels(module)
         else:
-            self.kernels |= make_row_kernels(name, features)
+            self.kernels = make_cell_kernels(name, features) | make_row_kernels(name, features)
         self._allocate_cells()
         self._allocate_rows()
         self._allocate_pairs()

@@ -38,7 +38,7 @@ class NodeFeatures:
 
 
 @cache
-def make_node_sweep(name: str, features: NodeFeatures):
+def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
     """Kernel `node_sweep` in the given precision with the given features."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
@@ -135,7 +135,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
             stretch = wp.max(stretch, norm)
         return half * (skin - stretch * list_reach)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def node_sweep(
         offset: wp.int32,
         dt: real,

@@ -28,7 +28,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("fibers", "layers", (), FIBER_ADVICE),
     Row("fibers", "length_distribution", (), FIBER_ADVICE),
-    Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
     Row("contact", "law", ("none", "exponential"), 'use law = "exponential" or "none"'),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
@@ -47,7 +46,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("numerics", "method", ("bead_chain", "overdamped", "rigid_rod", "auto"), METHOD_ADVICE),
     Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
-    Row("load", "", (), "remove the table; fibers move freely"),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 

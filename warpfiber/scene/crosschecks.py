@@ -13,6 +13,7 @@ from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
+from warpfiber.scene.loads import check_loads
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.tables import strain_rate
 
@@ -41,6 +42,7 @@ def cross_check(draft: Draft) -> None:
     _check_contact(draft)
     _check_stages(draft)
     _check_rest(draft)
+    check_loads(draft)
 
 
 def _check_tables(draft: Draft) -> None:
@@ -87,7 +89,7 @@ def _check_method(draft: Draft) -> None:
     for index, group in enumerate(draft.fibers):
         if draft.is_given(f"fibers.{index}.initial_velocity"):
             draft.note(f"fibers.{index}.initial_velocity has no effect in method {draft.method}")
-        if draft.gravity is not None and group["density"] is None:
+        if draft.gravity is not None and group["density"] is None and not group["frozen"]:
             draft.faults.add(
                 f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
             )
