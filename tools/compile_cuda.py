@@ -40,6 +40,7 @@ from warpfiber.passes.measure import (
 )
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rows import make_row_kernels
 from warpfiber.passes.step_control import (
     make_largest_error,
@@ -172,6 +173,8 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "chain_step", "", make_chain_step(precision)
     yield "chain_step", "loads", make_chain_step(precision, True, True)
     yield "carry_fibers", "", make_carry_fibers(precision, True, CHI)
+    yield "rod_maps", "", make_rod_maps(precision)
+    yield "rod_step", "", make_rod_step(precision)
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     for variant, adaptive in (("plain", False), ("tolerance", True)):

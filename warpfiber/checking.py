@@ -103,7 +103,13 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     numerics = scene.numerics
     limits, dt = step_limits(scene), chosen_step(scene)
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
-    if numerics.method == "overdamped":
+    if scene.method_reason is not None:
+        rows.append(("chosen by auto", scene.method_reason))
+    if numerics.method == "rigid_rod":
+        rows.append(("dt limit", limits[0].term))
+        share = f" = strain {dt * scene.flow.rate:.3g}" if scene.flow and scene.flow.rate else ""
+        rows.append(("dt", f"{dt:.4g} s{share}"))
+    elif numerics.method == "overdamped":
         rows.append(("dt limit", f"none; a turn is followed up to a strain of {LARGEST_STRAIN}"))
         share = ""
         if math.isfinite(limits[0].dt):
