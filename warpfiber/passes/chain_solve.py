@@ -39,7 +39,7 @@ CHI = 1.0 - 1.0 / math.sqrt(2.0)
 def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
     """Kernel `chain_step`: one step of BDF2 (`stages` 1) or SDIRK2 (2) of every fiber.
 
-    `loaded`: nodes have a force or, where `node_hold` says so, a velocity in `node_load`, and frozen
+    `loaded`: nodes have a force or, as `node_hold` says, a velocity in `node_load`, and frozen
     fibers are left to `carry_fibers`; `sheared`: stored images move with the flow.
 
     `keeps`: steps may be rejected, so the state of the start is kept and a tear left to the error.
