@@ -17,7 +17,7 @@ import warp as wp
 
 from warpfiber.methods.skin import SkinChoice
 from warpfiber.model import BAD_FIBER, EXPIRED, TORN, Model, State
-from warpfiber.passes.executor import Call, Executor, Launch, load_kernels
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat, flat, load_kernels
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
@@ -58,7 +58,7 @@ class Method(ABC):
         self.pair_force = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
 
     @abstractmethod
-    def launches(self) -> list[Launch | Call]:
+    def launches(self) -> list[Launch | Call | Repeat]:
         """The launches of one step."""
 
     def _choose_workers(self, workers: int | None) -> int:
@@ -96,7 +96,7 @@ class Method(ABC):
         """
         if self.executor is None:
             launches = self.launches()
-            stepping = [launch.kernel for launch in launches if isinstance(launch, Launch)]
+            stepping = [launch.kernel for launch in flat(launches) if isinstance(launch, Launch)]
             load_kernels([*stepping, *measuring], self.model.device)
             self.executor = Executor(launches, self.model.device, self.workers)
 

@@ -18,70 +18,44 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
-from warpfiber.methods.method import Method
+from warpfiber.methods.implicit import Implicit, Launches
 from warpfiber.model import Model, State
-from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.executor import Launch
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step, rod_map
-from warpfiber.passes.step_control import make_step_begin, make_step_end
+from warpfiber.passes.rod_response import rod_apply_launch, rod_response_launch
+from warpfiber.passes.unilateral import ContactDual
 from warpfiber.scene import Fault, Scene, SceneError
 
 
-class RigidRod(Method):
+class RigidRod(Implicit):
     """Advances a State of fibers of one segment by exact maps."""
-
-    inertia = False
 
     def __init__(
         self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
     ) -> None:
         _check_nodes(scene)
         super().__init__(scene, model, state, dt, workers)
-        p, device = model.precision, model.device
-        self.node_back = wp.zeros(0, dtype=p.vec3, device=device)
-        self.velocity_back = wp.zeros(0, dtype=p.vec3, device=device)
         mu = [turning_share(row) for row in model.group_rows]
         settling = np.asarray([row["body_force"] / row["drag"] for row in model.group_rows])
-        self.shape_mu = wp.array(mu, dtype=wp.float64, device=device)
-        self.shape_settling = wp.array(settling, dtype=wp.vec3d, device=device)
-        self.maps = wp.zeros(len(mu), dtype=rod_map(p.name), device=device)
-        self.stage_gradient = wp.zeros(2, dtype=p.mat33, device=device)
-        self.strain_next = wp.zeros(1, dtype=wp.float64, device=device)
-        self.ends_lattice = wp.zeros(2, dtype=p.mat33, device=device)  # of the step under way
-        self.deformation_next = wp.zeros(1, dtype=wp.mat33d, device=device)
-        self.rejected = wp.zeros(2, dtype=wp.int32, device=device)
-        self.step_size = wp.array([self.dt], dtype=wp.float64, device=device)
-
-    def keep_start(self) -> None:
-        """From the first step on, leave the start of each in `node_back` and `velocity_back`."""
-        p, nodes = self.model.precision, self.model.node_count
-        self.node_back = wp.zeros(nodes, dtype=p.vec3, device=self.model.device)
-        self.velocity_back = wp.zeros(nodes, dtype=p.vec3, device=self.model.device)
+        self.shape_mu = wp.array(mu, dtype=wp.float64, device=model.device)
+        self.shape_settling = wp.array(settling, dtype=wp.vec3d, device=model.device)
+        shape = rod_map(model.precision.name)
+        self.maps = wp.zeros(len(mu), dtype=shape, device=model.device)
+        self._make_contact()
 
     # -- the step ---------------------------------------------------------------------------------
 
-    def launches(self) -> list[Launch | Call]:
-        """Begin, maps, fibers and end of a step."""
-        return [self._begin(), self._maps(), self._move(), self._end()]
+    def motion(self) -> Launches:
+        """Maps of the step, and the rods by them."""
+        return [self._maps(), self._move()]
 
-    def _begin(self) -> Launch:
-        state = self.state
-        inputs = [
-            wp.float64(self.flow_rate),
-            wp.mat33d(*self.full_gradient.ravel()),
-            self._schedule(),
-            self.step_size,
-            state.strain,
-            state.lattice,
-            state.deformation,
-            state.status,
-            self.rejected,
-            self.strain_next,
-            self.stage_gradient,
-            self.ends_lattice,
-            self.deformation_next,
-        ]
-        begin = make_step_begin(self.model.precision.name, self.model.domain.sheared)
-        return Launch("begin", begin, 1, inputs)
+    def response(self, dual: ContactDual) -> Launch:
+        """Center and direction of every rod by the forces on it."""
+        return rod_response_launch(dual)
+
+    def apply(self, dual: ContactDual) -> Launch:
+        """Rods by the solution, their lengths kept."""
+        return rod_apply_launch(dual, carried=1.0)
 
     def _maps(self) -> Launch:
         inputs = [
@@ -102,7 +76,7 @@ class RigidRod(Method):
     def _move(self) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
         inputs = [
-            1 if self.node_back.shape[0] else 0,
+            1 if self.keeps else 0,
             p.vec3(*self.flow_origin),
             self.maps,
             model.fiber_group,
@@ -115,44 +89,6 @@ class RigidRod(Method):
             state.status,
         ]
         return Launch("fibers", make_rod_step(p.name), model.fiber_count, inputs, split=True)
-
-    def _end(self) -> Launch:
-        model, state = self.model, self.state
-        none, nobody = (wp.zeros(0, dtype=t, device=model.device) for t in (wp.float64, wp.int32))
-        inputs = [
-            wp.mat33d(*self.full_gradient.ravel()),
-            self._schedule(),
-            wp.float64(0.0),  # no tolerance: no step is rejected
-            wp.float64(self.dt),
-            none,
-            nobody,
-            nobody,
-            self.strain_next,
-            self.step_size,
-            self.rejected,
-            state.step,
-            state.time,
-            state.strain,
-            state.gradient,
-            state.lattice,
-            state.lattice_now,
-            state.deformation,
-            state.status,
-        ]
-        end = make_step_end(model.precision.name, model.domain.sheared, adaptive=False)
-        return Launch("end", end, 1, inputs)
-
-    def _schedule(self) -> wp.array:
-        return wp.array(self.schedule, dtype=wp.vec2d, device=self.model.device)
-
-    # -- what is saved and told -------------------------------------------------------------------
-
-    def saved(self) -> dict[str, np.ndarray]:
-        """Nothing: the nodes are all that the next step depends on."""
-        return {}
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over what `saved` returned."""
 
 
 def turning_share(row: Mapping[str, float]) -> float:

@@ -197,8 +197,11 @@ def make_step_end(name: str, sheared: bool, adaptive: bool, judged: bool = False
 
 
 @cache
-def make_take_back(name: str):
-    """Kernel `take_back`: every fiber as before a rejected step, one thread per fiber."""
+def make_take_back(name: str, tense: bool = True):
+    """Kernel `take_back`: every fiber as before a rejected step, one thread per fiber.
+
+    `tense`: segments carry a tension from step to step.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
 
@@ -221,7 +224,8 @@ def make_take_back(name: str):
         for i in range(fiber_node_start[fiber], last + 1):
             node_pos[i] = node_back[i]
             node_velocity[i] = velocity_back[i]
-            if i < last:
-                tension[i - fiber] = tension_back[i - fiber]
+            if wp.static(tense):
+                if i < last:
+                    tension[i - fiber] = tension_back[i - fiber]
 
     return take_back
