@@ -29,8 +29,9 @@ from typing import Any
 import warp as wp
 
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
-from warpfiber.passes.chain_solve import make_chain_step
+from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.measure import (
     MeasureFeatures,
     make_measure_fibers,
@@ -39,6 +40,7 @@ from warpfiber.passes.measure import (
 )
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rows import make_row_kernels
 from warpfiber.passes.step_control import (
     make_largest_error,
@@ -169,6 +171,10 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         yield "clock_step", variant, make_clock(precision, sheared, scheduled)
     yield "step_begin", "", make_step_begin(precision)
     yield "chain_step", "", make_chain_step(precision)
+    yield "chain_step", "loads", make_chain_step(precision, True, True)
+    yield "carry_fibers", "", make_carry_fibers(precision, True, CHI)
+    yield "rod_maps", "", make_rod_maps(precision)
+    yield "rod_step", "", make_rod_step(precision)
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     for variant, adaptive in (("plain", False), ("tolerance", True)):

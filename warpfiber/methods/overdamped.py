@@ -1,7 +1,7 @@
 """Fibers without inertia: linearly implicit SDIRK2 or BDF2, one banded solve per fiber and stage.
 
-A step: begin (flow at the stages), fibers (`chain_solve`), end (time, flow, and with a tolerance
-the acceptance and the size of the next step). The tension is carried from step to step.
+A step: begin (flow at the stages), fibers (`chain_solve`), frozen fibers, end (time, flow, and with
+a tolerance the acceptance and the size of the next step). The tension is carried from step to step.
 Source: Galerkin drag of the beads, hydrodynamic torque, stretching in compliance form (modulus, or
     segments that keep their length), bending of straight rest shapes; SDIRK2 and its embedded
     first-order error estimate, BDF2 started by one SDIRK2 step.
@@ -16,12 +16,14 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.loads import node_loads
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import Model, State
-from warpfiber.passes.chain_solve import make_chain_step
+from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.step_control import (
     ERROR_CHUNKS,
     make_largest_error,
@@ -60,12 +62,18 @@ class Overdamped(Method):
         self.row_stride = -most if device.startswith("cpu") else most
         row = elimination_row(p.name)
         self.rows = wp.empty(most * model.fiber_count, dtype=row, device=device)
+        hold, load = node_loads(scene, model)
+        self.node_hold = wp.array(hold, dtype=wp.uint8, device=device)
+        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
         chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
         self.error = wp.zeros(chunks, dtype=wp.float64, device=device)
         self.error_fiber = wp.zeros(chunks, dtype=wp.int32, device=device)
         self.stage_gradient = wp.zeros(2, dtype=p.mat33, device=device)
         self.strain_next = wp.zeros(1, dtype=wp.float64, device=device)
+        self.ends_lattice = wp.zeros(2, dtype=p.mat33, device=device)  # of the step under way
+        self.deformation_next = wp.zeros(1, dtype=wp.mat33d, device=device)
+        self.verdict = wp.zeros(2, dtype=wp.int32, device=device)
         self.rejected = wp.zeros(2, dtype=wp.int32, device=device)  # the last step, and in all
         first = step_start(scene) / model.units.time if self.adaptive else self.dt
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
@@ -82,6 +90,8 @@ class Overdamped(Method):
         model, state = self.model, self.state
         name = model.precision.name
         steps: list[Launch | Call] = [self._begin(), self._solve(stages)]
+        if any(group.frozen for group in self.scene.fibers):
+            steps.append(self._carry())
         if self.adaptive:
             chunks = self.error.shape[0]
             errors = [chunks, self.fiber_error, self.error, self.error_fiber]
@@ -97,7 +107,6 @@ class Overdamped(Method):
                 state.node_pos,
                 state.node_velocity,
                 self.tension,
-                state.status,
             ]
             back = make_take_back(name)
             steps.append(Launch("take_back", back, model.fiber_count, inputs, split=True))
@@ -111,11 +120,17 @@ class Overdamped(Method):
             self._schedule(),
             self.step_size,
             state.strain,
+            state.lattice,
+            state.deformation,
             state.status,
+            self.rejected,
             self.strain_next,
             self.stage_gradient,
+            self.ends_lattice,
+            self.deformation_next,
         ]
-        return Launch("begin", make_step_begin(self.model.precision.name), 1, inputs)
+        begin = make_step_begin(self.model.precision.name, self.model.domain.sheared)
+        return Launch("begin", begin, 1, inputs)
 
     def _solve(self, stages: int) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
@@ -138,9 +153,38 @@ class Overdamped(Method):
             self.node_back,
             self.velocity_back,
             self.fiber_error,
+            self.node_hold,
+            self.node_load,
+            state.fiber_image,
+            state.lattice,
             state.status,
         ]
-        return Launch("fibers", make_chain_step(p.name), model.fiber_count, inputs, split=True)
+        loaded = self.node_hold.shape[0] > 0
+        kernel = make_chain_step(p.name, loaded, loaded and model.domain.sheared)
+        return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
+
+    def _carry(self) -> Launch:
+        model, state = self.model, self.state
+        inputs = [
+            1 if self.adaptive else 0,
+            self.row_stride,
+            self.step_size,
+            self.stage_gradient,
+            model.fiber_node_start,
+            self.node_hold,
+            self.node_load,
+            state.fiber_image,
+            state.lattice,
+            self.rows,
+            state.node_pos,
+            state.node_velocity,
+            self.node_motion,
+            self.node_back,
+            self.velocity_back,
+            state.status,
+        ]
+        kernel = make_carry_fibers(model.precision.name, model.domain.sheared, CHI)
+        return Launch("frozen", kernel, model.fiber_count, inputs, split=True)
 
     def _end(self) -> Launch:
         model, state = self.model, self.state
@@ -153,6 +197,7 @@ class Overdamped(Method):
             wp.float64(self.dt),
             self.error,
             self.error_fiber,
+            self.verdict,
             self.strain_next,
             self.step_size,
             self.rejected,
@@ -212,5 +257,5 @@ def overdamped_bytes(nodes: int, segments: int, real: int, adaptive: bool) -> in
 
     On the CPU the rows, by far the largest, are allocated but hardly touched.
     """
-    per_node = 28 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
+    per_node = 29 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
     return real * (nodes * per_node + 2 * segments)

@@ -66,7 +66,7 @@ SEARCH = r"""
     // what passed the first test: owner, place, image; planes: X ... AZ, margin, owner's half axis
     int owner[ROOM], hit[ROOM], image[ROOM], hits = 0;
     float near[10][ROOM];
-    auto compare = [&]() {
+    auto compare = [&]() __attribute__((noinline)) {
         tested += hits;
         for (int c = 0; c < hits; c += W) {
             const F qx = V::load(near[0] + c), qy = V::load(near[1] + c);
@@ -209,14 +209,16 @@ assert GEOMETRY_PLANES == 7
 
 
 @cache
-def make_search_kernels(name: str, periodic: tuple[bool, bool, bool], pieces: bool):
+def make_search_kernels(
+    name: str, periodic: tuple[bool, bool, bool], pieces: bool, module: str = "unique"
+):
     """`search_pairs` (over workers) and `confirm_pairs` (over found places) as a dict by name."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     closest_fractions = make_segment_distance(name)
     mask = WRAP_Y - 1
     offset_image = WRAP_Y // 2
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func_native(_search_text(periodic))
     def search(

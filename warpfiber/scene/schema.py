@@ -7,6 +7,7 @@ Defaults that depend on other tables are resolved in `resolving.py`, rules betwe
 
 from __future__ import annotations
 
+from warpfiber.scene.derived import INERTIALESS
 from warpfiber.scene.keys import Inline, Key, OneOf, Table
 from warpfiber.scene.kinds import (
     Choice,
@@ -314,13 +315,13 @@ NUMERICS = Table(
             "closure",
             Choice(("none", "paper", "consistent")),
             default="consistent",
-            methods=("bead_chain", "overdamped"),
+            methods=("bead_chain", *INERTIALESS),
         ),
         Key(
             "torque_weights",
             Choice(("end_weighted", "plain")),
             default="end_weighted",
-            methods=("bead_chain", "overdamped"),
+            methods=("bead_chain", *INERTIALESS),
         ),
         Key(
             "integrator",
