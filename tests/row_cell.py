@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from tests.cell import BOX_IMAGES, Kind
+from tests.cell import BOX_IMAGES, Kind, bent_fiber
 from tests.reference.chain_rows import PairRow, Side, pair_rows
 from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.executor import Executor
@@ -174,3 +174,19 @@ def host_rows(rows: ContactRows) -> dict[str, np.ndarray]:
     n = int(rows.row_count.numpy()[0])
     names = "i j key s t normal base compliance force".split()
     return {name: getattr(rows, f"row_{name}").numpy()[:n] for name in names}
+
+
+def dropped(kinds: tuple[Kind, ...], count: int, seed: int, edge: float) -> tuple[list, np.ndarray]:
+    """Fibers at random in a cube; many overlap."""
+    rng = np.random.default_rng(seed)
+    which = np.arange(count) % len(kinds)
+    return [bent_fiber(kinds[k], rng, edge * rng.random(3), spread=1.0) for k in which], which
+
+
+def shaken(seed: int, size: float = 0.2) -> Any:
+    """Motion of nodes over a step."""
+
+    def move(nodes: np.ndarray) -> np.ndarray:
+        return size * np.random.default_rng(seed).normal(size=nodes.shape)
+
+    return move

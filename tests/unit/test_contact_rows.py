@@ -13,33 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.cell import Kind, bent_fiber, straight_fiber
-from tests.reference import interactions as ia
+from tests.cell import Kind, straight_fiber
 from tests.reference.contact_rows import Line, line_rows
-from tests.row_cell import RowCell, host_rows, row_cell, run
+from tests.row_cell import RowCell, dropped, host_rows, row_cell, run, shaken
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
 TOLERANCE = {"float64": 1e-9, "float32": 1e-3}
 SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
-EDGES = np.array([24.0, 20.0, 12.0])
 BOX = {"size": [26.0, 22.0, 24.0]}
-
-
-def drop(kinds: tuple[Kind, ...], count: int, seed: int, edge: float) -> tuple[list, np.ndarray]:
-    """Fibers at random in a cube; many overlap."""
-    rng = np.random.default_rng(seed)
-    which = np.arange(count) % len(kinds)
-    return [bent_fiber(kinds[k], rng, edge * rng.random(3), spread=1.0) for k in which], which
-
-
-def shaken(seed: int, size: float = 0.2) -> Any:
-    """Motion of nodes over a step."""
-
-    def move(nodes: np.ndarray) -> np.ndarray:
-        return size * np.random.default_rng(seed).normal(size=nodes.shape)
-
-    return move
 
 
 def check_pairs(cell: RowCell, keep: float = 0.5, least: int = 20) -> None:
@@ -84,14 +66,14 @@ CHAINS = (Kind(3, 3.0), Kind(4, 1.5, radius=0.6))
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("kinds", [RODS, (Kind(1, 6.0), Kind(1, 9.0, radius=0.6)), CHAINS])
 def test_rows_of_random_fibers(start: Start, kinds: tuple[Kind, ...], precision: str) -> None:
-    fibers, which = drop(kinds, 40, 1, 20.0)
+    fibers, which = dropped(kinds, 40, 1, 20.0)
     check_pairs(row_cell(start, kinds, fibers, which, move=shaken(2), precision=precision))
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("kinds", [RODS, CHAINS])
 def test_rows_of_sheared_images(start: Start, kinds: tuple[Kind, ...], precision: str) -> None:
-    fibers, which = drop(kinds, 60, 3, 24.0)
+    fibers, which = dropped(kinds, 60, 3, 24.0)
     lattice = np.diag([26.0, 22.0, 24.0])
     lattice[0, 2] = 7.0
     later = lattice.copy()
@@ -119,7 +101,7 @@ def rows_of(start: Start, fibers: list[np.ndarray], kinds: Any = RODS, **keys: A
 
 def test_rods_have_the_rows_of_their_lines(start: Start) -> None:
     # the restatement for chains is that for rods where every fiber has one segment
-    fibers, which = drop(RODS, 30, 5, 16.0)
+    fibers, which = dropped(RODS, 30, 5, 16.0)
     cell = row_cell(start, RODS, fibers, which)
     expected = []
     for i, j, _ in cell.listed():
@@ -225,99 +207,8 @@ def test_every_near_place_of_two_chains_is_covered(start: Start, seed: int) -> N
     assert ((apart < 0.1).sum(axis=1) <= 1).all()
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_walls(start: Start, precision: str) -> None:
-    kinds = (Kind(3, 2.0), Kind(1, 3.0, radius=0.5))
-    rng = np.random.default_rng(7)
-    which = np.arange(40) % 2
-    fibers = [bent_fiber(kinds[k], rng, EDGES * rng.random(3)) for k in which]
-    cell = row_cell(
-        start,
-        kinds,
-        fibers,
-        which,
-        move=shaken(8),
-        precision=precision,
-        box={"size": EDGES.tolist(), "boundary": ["periodic", "wall", "wall"]},
-        contact={"law": "exponential", "strength": 1.0, "decay": 2.0},
-    )
-    got = host_rows(cell.made())
-    host, moved = cell.sim.model.host, cell.sim.state.node_pos.numpy()
-    expected = []
-    for i, node in enumerate(host["segment_node"]):
-        fiber = host["segment_fiber"][i]
-        a = cell.radius(i)
-        ends = (0, 1) if node == host["fiber_node_start"][fiber] else (1,)
-        for end in ends:
-            for axis, edge in ((1, EDGES[1]), (2, EDGES[2])):
-                for side, y in enumerate((moved[node + end][axis], edge - moved[node + end][axis])):
-                    if y - a < 0.5 * a:
-                        normal = np.zeros(3)
-                        normal[axis] = 2 * side - 1
-                        expected.append((i, end, normal, y - a))
-    walls = np.flatnonzero(got["j"] == -1)
-    assert len(walls) == len(expected) > 8
-    for r, (i, end, normal, gap) in zip(walls, expected, strict=True):
-        assert (got["i"][r], got["s"][r]) == (i, end)
-        assert (got["normal"][r] == normal).all()
-        assert abs(got["base"][r] - gap) < 8 * np.finfo(cell.real).eps * 20.0
-    check_pairs(cell)
-
-
-def resistances(cell: RowCell, kind: str) -> list[tuple[int, int, float, float, float, float]]:
-    """(i, j, s, t, n.w, c) of the bead pairs in range, in the order of the list."""
-    found = []
-    for i, j, image in cell.listed():
-        back, now = cell.offsets(image)
-        (side_i, motion_i), (side_j, motion_j) = (
-            cell.side(i, np.zeros(3), False),
-            cell.side(j, back, False),
-        )
-        motion_j = motion_j + (now - back)
-        beads = [
-            list(
-                zip(
-                    *ia.segment_beads(cell.group(k)["spacing"], side.following is None),
-                    strict=True,
-                )
-            )
-            for k, side in ((i, side_i), (j, side_j))
-        ]
-        for s, weight_i in beads[0]:
-            for t, weight_j in beads[1]:
-                apart = side_j.at(t) - side_i.at(s)
-                distance = float(np.linalg.norm(apart))
-                c = ia.lubrication_coefficient(distance, cell.radius(i), cell.radius(j), 1.0, kind)
-                if c > 0.0:
-                    w = (1 - t) * motion_j[0] + t * motion_j[1]
-                    w = w - (1 - s) * motion_i[0] - s * motion_i[1]
-                    c *= weight_i * weight_j
-                    found.append((i, j, float(s), float(t), float(apart @ w) / distance, c))
-    return found
-
-
-@pytest.mark.parametrize("kind", ["paper", "shifted"])
-@pytest.mark.parametrize("box", [None, BOX])
-def test_lubrication_rows_are_the_bead_pairs(start: Start, kind: str, box: Any) -> None:
-    kinds = (Kind(3, 3.4), Kind(1, 6.0, radius=0.6))
-    fibers, which = drop(kinds, 30, 9, 20.0)
-    tables = {} if box is None else {"box": box}
-    cell = row_cell(start, kinds, fibers, which, move=shaken(3), flow=SHEAR, **tables)
-    got = host_rows(cell.made(lubrication=kind))
-    wet = np.flatnonzero(got["compliance"] > 0.0)
-    expected = resistances(cell, kind)
-    assert len(wet) == len(expected) > 50
-    for r, (i, j, s, t, approach, c) in zip(wet, expected, strict=True):
-        assert (got["i"][r], got["j"][r]) == (i, j)
-        assert abs(got["s"][r] - s) < 1e-12 and abs(got["t"][r] - t) < 1e-12
-        assert abs(got["base"][r] - approach) < 1e-12
-        assert abs(got["compliance"][r] * c / 0.1 - 1.0) < 1e-9
-    dry = np.flatnonzero((got["compliance"] == 0.0) & (got["j"] >= 0))
-    assert [(got["i"][r], got["j"][r]) for r in dry] == [row[:2] for row in cell.expected()]
-
-
 def test_rows_do_not_depend_on_the_workers(start: Start) -> None:
-    fibers, which = drop(CHAINS, 60, 11, 22.0)
+    fibers, which = dropped(CHAINS, 60, 11, 22.0)
     cell = row_cell(start, CHAINS, fibers, which, move=shaken(1), box=BOX, flow=SHEAR)
     one, two = (host_rows(cell.made(workers, lubrication="paper")) for workers in (1, 2))
     for name, values in one.items():
@@ -325,7 +216,7 @@ def test_rows_do_not_depend_on_the_workers(start: Start) -> None:
 
 
 def test_a_small_capacity_grows_and_keeps_the_forces(start: Start) -> None:
-    fibers, which = drop(CHAINS, 40, 12, 18.0)
+    fibers, which = dropped(CHAINS, 40, 12, 18.0)
     cell = row_cell(start, CHAINS, fibers, which, move=shaken(1))
     plenty = cell.made()
     tight = cell.rows(capacity=1)
@@ -350,7 +241,7 @@ def forced(rows: Any) -> np.ndarray:
 
 
 def test_forces_start_from_those_of_the_last_step(start: Start) -> None:
-    fibers, which = drop(CHAINS, 40, 13, 20.0)
+    fibers, which = dropped(CHAINS, 40, 13, 20.0)
     cell = row_cell(start, CHAINS, fibers, which, box=BOX, flow=SHEAR)
     rows = cell.made(lubrication="paper")
     force = forced(rows)
@@ -386,7 +277,7 @@ def test_forces_start_from_those_of_the_last_step(start: Start) -> None:
 
 
 def test_growing_keeps_the_forces(start: Start) -> None:
-    fibers, which = drop(CHAINS, 40, 13, 20.0)
+    fibers, which = dropped(CHAINS, 40, 13, 20.0)
     cell = row_cell(start, CHAINS, fibers, which)
     rows = cell.made()
     count = len(host_rows(rows)["i"])
@@ -405,7 +296,7 @@ def test_growing_keeps_the_forces(start: Start) -> None:
 def test_a_halted_step_makes_nothing(start: Start) -> None:
     from warpfiber.model import HALT
 
-    fibers, which = drop(RODS, 30, 1, 16.0)
+    fibers, which = dropped(RODS, 30, 1, 16.0)
     cell = row_cell(start, RODS, fibers, which)
     rows = cell.made()
     before = host_rows(rows)
