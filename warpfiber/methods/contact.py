@@ -88,7 +88,7 @@ class ImplicitContact:
             reach = max(reach, OUTER * 2.0 * max(radii))
         self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
         self.solves: list[tuple[ContactRows, ContactDual]] = []
-        for again in range(scene.numerics.linearizations):
+        for again in range(scene.numerics.linearizations or 1):
             lattice = step.ends_lattice
             rows = ContactRows(
                 model,
@@ -108,7 +108,7 @@ class ImplicitContact:
                 response,
                 step_size=step.step_size,
                 node_start=step.node_back,
-                tolerance=scene.numerics.contact_tolerance * min(radii),
+                tolerance=(scene.numerics.contact_tolerance or 1e-3) * min(radii),
                 law=contact_law(scene, model),
                 fiber_frozen=fiber_frozen,
             )

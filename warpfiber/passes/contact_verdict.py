@@ -1,7 +1,7 @@
 """What the contacts of a step decide: go on, halve it, or repeat it with a larger list or rows.
 
-Source: a step is kept if at its end no pair overlaps by more than a given share of the radius, and no
-    center lines passed through each other or a wall.
+Source: a step is kept if at its end no pair overlaps by more than a given share of the radius and
+    no center lines passed through each other or a wall.
 """
 
 from functools import cache

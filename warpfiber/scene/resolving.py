@@ -218,6 +218,9 @@ def _resolve_contact(draft: Draft) -> None:
     flow = draft.flow_object
     if flow is None:
         return
+    if draft.numerics["contact"] == "unilateral" or contact["law"] == "linear":
+        contact["strength"] = 0.0  # has no meaning there
+        return
     if flow.rate == 0.0:
         remedy = "missing: no flow rate to set it; give N"
         if contact["law"] == "none":

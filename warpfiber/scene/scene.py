@@ -88,7 +88,11 @@ class Numerics:
     """end_weighted, plain"""
     integrator: str | None = None
     contact: str
-    """penalty"""
+    """penalty, unilateral"""
+    contact_tolerance: float | None = None
+    """radii of the thinnest fiber, of the gaps of unilateral and implicit contact"""
+    linearizations: int | None = None
+    """of contact in a step: 1, or 2 to push against what the first left"""
     dt: float | None = None
     """s; None = auto. `strain_step` is already turned into it."""
     strain_step: float | None = None

@@ -335,6 +335,8 @@ NUMERICS = Table(
             default="penalty",
             method_default=(("overdamped", "unilateral"), ("rigid_rod", "unilateral")),
         ),
+        Key("contact_tolerance", Number(above=0), default=1e-3, methods=INERTIALESS),
+        Key("linearizations", Number(least=1, below=3, whole=True), default=1, methods=INERTIALESS),
         Key("dt", Either((Number("s", above=0), AUTO))),
         Key("strain_step", Number(above=0)),
         Key("tolerance", Number(above=0), methods=("overdamped",)),
