@@ -28,6 +28,7 @@ from warpfiber.passes.unilateral import ContactDual, ContactLaw
 from warpfiber.scene import Scene
 
 OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
+FINITE = 1e20  # radii; penalties may overlap
 Launches = list[Launch | Call | Repeat]
 
 
@@ -82,6 +83,7 @@ class ImplicitContact:
     ) -> None:
         self.scene, self.model, self.state, self.step = scene, model, state, step
         self.apply, self.flow_origin = apply, flow_origin
+        self.hard = scene.numerics.contact == "unilateral"
         radii = [row["radius"] for row in model.group_rows]
         reach = 2.0 * max(radii) + KEEP * min(radii)
         if scene.contact.lubrication != "none":
@@ -141,7 +143,7 @@ class ImplicitContact:
             found += [*rows.launches(), *dual.launches(), self.apply(dual)]
         needs = [rows.row_need for rows, _ in self.solves]
         judge = [
-            wp.float64(OVERLAP),
+            wp.float64(OVERLAP if self.hard else FINITE),
             needs[0],
             needs[1] if len(needs) > 1 else self.no_need,
             self.check.largest,

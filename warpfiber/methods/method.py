@@ -188,8 +188,9 @@ class Method(ABC):
         fiber = int(state.status.numpy()[BAD_FIBER])
         if len(bad):  # several may have torn in one step, in any order
             fiber = int(model.host["segment_fiber"][bad[0]])
+        stored = self.list if self.pair_acts.shape[0] else None  # forces by listed pair
         sizes = measure_fiber_terms(
-            model, state, fiber, self.flow_origin, self.list, self.pair_acts, self.pair_force
+            model, state, fiber, self.flow_origin, stored, self.pair_acts, self.pair_force
         )
         mine = stretch[model.host["segment_fiber"] == fiber]
         worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))
