@@ -30,8 +30,10 @@ import warp as wp
 
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_solve import CHI, make_chain_step
+from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.held_nodes import make_carry_fibers
+from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.measure import (
     MeasureFeatures,
     make_measure_fibers,
@@ -41,6 +43,8 @@ from warpfiber.passes.measure import (
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
+from warpfiber.passes.row_count import RowFeatures, make_row_count
+from warpfiber.passes.row_fill import make_row_fill
 from warpfiber.passes.rows import make_row_kernels
 from warpfiber.passes.step_control import (
     make_largest_error,
@@ -190,10 +194,21 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         "deformed": ListFeatures((True, True, True), None, True),
         "pieces": ListFeatures((True, True, True), (0, 2), True, True),
     }
-    for variant, features in lists.items():
+    for variant, list_features in lists.items():
         for make in (make_cell_kernels, make_row_kernels):
-            for name, kernel in make(precision, features).items():
+            for name, kernel in make(precision, list_features).items():
                 yield name, variant, kernel
+    for variant, walls, lubrication in (
+        ("sheared", (False, False, False), "none"),
+        ("wall paper", (False, False, True), "paper"),
+    ):
+        features = RowFeatures(True, walls, lubrication)
+        checks = make_check_sweeps(precision, CheckFeatures(True, walls))
+        for name, kernel in (make_row_count(precision, features) | checks).items():
+            yield name, variant, kernel
+        yield "fill_rows", variant, make_row_fill(precision, features)
+    for name, kernel in make_list_bound(precision).items():
+        yield name, "", kernel
     for variant, fibers in {
         "orientation": MeasureFeatures(),
         "everything": MeasureFeatures(orientation4=True, energy=True, curvature=True),

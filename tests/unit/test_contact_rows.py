@@ -16,6 +16,7 @@ import pytest
 from tests.cell import Kind, straight_fiber
 from tests.reference.contact_rows import Line, line_rows
 from tests.row_cell import RowCell, dropped, host_rows, row_cell, run, shaken
+from warpfiber.model import HALT
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
@@ -293,16 +294,33 @@ def test_growing_keeps_the_forces(start: Start) -> None:
     assert (host_rows(small)["force"] == force).all()
 
 
-def test_a_halted_step_makes_nothing(start: Start) -> None:
-    from warpfiber.model import HALT
+def halt(cell: RowCell, value: int) -> None:
+    """Steps that do nothing from now on, or no longer."""
+    words = cell.sim.state.status.numpy().copy()
+    words[HALT] = value
+    cell.sim.state.status.assign(words)
 
+
+def test_forces_outlast_a_halted_step(start: Start) -> None:
+    fibers, which = dropped(CHAINS, 40, 13, 20.0)
+    cell = row_cell(start, CHAINS, fibers, which)
+    rows = cell.made()
+    force = forced(rows)
+    again = cell.rows()
+    again.restore(rows.saved())
+    halt(cell, 1)
+    run(again)
+    halt(cell, 0)
+    run(again)
+    assert (host_rows(again)["force"] == force).all()
+
+
+def test_a_halted_step_makes_nothing(start: Start) -> None:
     fibers, which = dropped(RODS, 30, 1, 16.0)
     cell = row_cell(start, RODS, fibers, which)
     rows = cell.made()
     before = host_rows(rows)
-    words = cell.sim.state.status.numpy().copy()
-    words[HALT] = 1
-    cell.sim.state.status.assign(words)
+    halt(cell, 1)
     cell.sim.state.node_pos.assign(cell.sim.state.node_pos.numpy() + 0.5)
     run(rows)
     after = host_rows(rows)

@@ -246,7 +246,10 @@ class ContactRows:
         }
 
     def _put(self, arrays: Mapping[str, np.ndarray]) -> None:
-        self.row_out_start.assign(np.asarray(arrays["row_out_start"]))
+        start = np.asarray(arrays["row_out_start"])
+        self.row_out_start.assign(start)
+        # a step that is halted before its count still takes the running sum
+        self.segment_rows.assign(np.diff(start))
         for key in ("row_j", "row_key", "row_force"):
             values = np.asarray(arrays[key])
             array = getattr(self, key)
