@@ -97,6 +97,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
     assert names == {
         *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
         *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
+        *("rod_maps rod_step".split()),
         *listed,
     }
     assert tool.PRECISIONS == ("float32", "float64")
