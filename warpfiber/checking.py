@@ -10,7 +10,7 @@ from warpfiber.methods.overdamped import overdamped_bytes
 from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import chosen_step, step_limits
 from warpfiber.methods.strain_steps import LARGEST_STRAIN
-from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
+from warpfiber.passes.neighbors import FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
     bead_count,
@@ -67,7 +67,7 @@ def box_strain_limit(scene: Scene) -> float:
         return math.inf
     diameter = max(group.diameter for group in scene.fibers)
     skin = START_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
-    longest = CELL_SLACK * FIRST_STRETCH * longest_segment(scene)
+    longest = FIRST_STRETCH * longest_segment(scene)
     return bearable_strain(scene, longest + contact_reach(scene) * diameter + skin)
 
 

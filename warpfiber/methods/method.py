@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.methods.skin import SkinChoice
-from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
+from warpfiber.model import BAD_FIBER, EXPIRED, TORN, Model, State
 from warpfiber.passes.executor import Call, Executor, Launch, load_kernels
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
@@ -125,7 +125,7 @@ class Method(ABC):
 
     def _halted(self) -> bool:
         status = self._status()
-        return bool(status[EXPIRED] or status[TORN] or status[STRETCHED])
+        return bool(status[EXPIRED] or status[TORN])
 
     def _status(self) -> np.ndarray:
         """The status words: on the CPU a view that is made once, looked at after every graph."""

@@ -257,5 +257,5 @@ def overdamped_bytes(nodes: int, segments: int, real: int, adaptive: bool) -> in
 
     On the CPU the rows, by far the largest, are allocated but hardly touched.
     """
-    per_node = 28 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
+    per_node = 29 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
     return real * (nodes * per_node + 2 * segments)

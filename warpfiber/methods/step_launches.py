@@ -180,7 +180,6 @@ def _node_inputs(chain: BeadChain) -> list[Any]:
         p.real(chain.strength),
         p.real(chain.decay),
         pairs.skin_out if pairs else wp.zeros(0, dtype=p.real, device=model.device),
-        p.real(pairs.stretch_allowed if pairs else 0.0),
         model.groups,
         model.pivots,
         model.fiber_node_start,

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.model import EXPIRED, HALT, STRETCHED, TORN, precision
+from warpfiber.model import EXPIRED, HALT, TORN, precision
 from warpfiber.passes.exponential import make_exponential
 
 SERIES_SIZE = 0.03  # row sum of L dt up to which the fourth order is enough
@@ -69,8 +69,7 @@ def make_clock(name: str, sheared: bool, scheduled: bool, module: str = "unique"
         lattice_now_out: wp.array(dtype=mat33),
         deformation: wp.array(dtype=wp.mat33d),
     ):
-        stop = status[wp.static(EXPIRED)] + status[wp.static(TORN)] + status[wp.static(STRETCHED)]
-        if stop != 0:
+        if status[wp.static(EXPIRED)] + status[wp.static(TORN)] != 0:
             status[wp.static(HALT)] = 1
             return
         status[wp.static(HALT)] = 0

@@ -20,7 +20,7 @@ from warpfiber.laws.flow import make_flow
 from warpfiber.laws.stretching import make_stretching
 from warpfiber.laws.torque import make_torque
 from warpfiber.laws.wall import make_wall
-from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN, precision
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN, precision
 from warpfiber.passes.precision import group_struct
 
 # A segment longer than this many rest lengths is no longer a physical state but a diverging step.
@@ -145,7 +145,6 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
         strength: real,
         decay: real,
         list_sizes: wp.array(dtype=real),
-        stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -345,7 +344,5 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
         if wp.static(has_pairs):
             if limit < zero or furthest > limit * limit:
                 status[wp.static(EXPIRED)] = 1
-            if longest > stretch_allowed * g.rest:
-                status[wp.static(STRETCHED)] = 1
 
     return node_sweep
