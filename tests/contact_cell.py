@@ -5,7 +5,7 @@ Units: as in `cell`, a = eta = 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -113,7 +113,7 @@ class Solved:
 def solve_rows(
     sim: Simulation,
     rows: Sequence[FlatRow],
-    response: Callable[[ContactDual], Any],
+    response: Any,
     dt: float,
     *,
     workers: int = 1,

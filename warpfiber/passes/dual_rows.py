@@ -118,8 +118,11 @@ def make_dual_step(name: str):
 
 
 @cache
-def make_dual_balance(name: str, law: str):
-    """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step."""
+def make_dual_balance(name: str, law: str, by_ends: bool):
+    """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
+
+    `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     opening, _ = make_contact_compliance(name, law)
@@ -144,6 +147,8 @@ def make_dual_balance(name: str, law: str):
         row_force: wp.array(dtype=real),
         row_change: wp.array(dtype=real),
         node_shift: wp.array(dtype=vec3),
+        row_end: wp.array(dtype=wp.int32),
+        end_move: wp.array(dtype=real),
         row_balance: wp.array(dtype=real),
         sums: wp.array(dtype=wp.float64),
         best: wp.array(dtype=wp.float64),
@@ -166,13 +171,19 @@ def make_dual_balance(name: str, law: str):
         turned = wp.float64(0.0)
         worst = real(0.0)
         for r in range(rows_begin(count, chunk, chunks), rows_begin(count, chunk + 1, chunks)):
-            node = row_node[r]
-            s = row_s[r]
-            move = -(one - s) * node_shift[node[0]] - s * node_shift[node[0] + 1]
-            if node[1] >= 0:
-                t = row_t[r]
-                move += (one - t) * node_shift[node[1]] + t * node_shift[node[1] + 1]
-            e = row_base[r] + wp.dot(row_normal[r], move)
+            e = row_base[r]
+            if wp.static(by_ends):
+                e += end_move[row_end[2 * r]]
+                if row_end[2 * r + 1] >= 0:
+                    e += end_move[row_end[2 * r + 1]]
+            else:
+                node = row_node[r]
+                s = row_s[r]
+                move = -(one - s) * node_shift[node[0]] - s * node_shift[node[0] + 1]
+                if node[1] >= 0:
+                    t = row_t[r]
+                    move += (one - t) * node_shift[node[1]] + t * node_shift[node[1] + 1]
+                e += wp.dot(row_normal[r], move)
             force = row_force[r]
             soft = row_compliance[r]
             weight = row_weight[r]

@@ -8,7 +8,6 @@ Limits: the response is linear in the forces and symmetric; see `rod_response`, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -53,6 +52,23 @@ class Incoming(Protocol):
     in_pair: Any
 
 
+class Response(Protocol):
+    """How fibers move by the forces of the rows: `rod_response`, `chain_response`."""
+
+    by_ends: bool  # it makes `row_end` and `end_move`, see `dual_rows.make_dual_balance`
+    row_end: Any
+    end_move: Any
+
+    def begin(self, dual: ContactDual) -> list[Launch | Call]:
+        """Launches after the lists of the fibers."""
+
+    def repeat(self, dual: ContactDual) -> Launch:
+        """The motion by the present forces, in every update."""
+
+    def end(self, dual: ContactDual) -> list[Launch | Call]:
+        """Launches that leave `node_shift` of the solution."""
+
+
 @dataclass(frozen=True)
 class ContactLaw:
     """`hard`, `linear` (stiffness) or `exponential` (strength and decay), in run units."""
@@ -65,8 +81,7 @@ class ContactLaw:
 class ContactDual:
     """Solves for `rows.row_force` and leaves the response of the fibers in `node_shift`.
 
-    `response(dual)` is the launch that makes `node_shift` of the row forces. Arrays as long as the
-    rows are made by `launches`, so call it again when the rows grow.
+    Arrays as long as the rows are made by `launches`, so call it again when the rows grow.
     """
 
     def __init__(
@@ -75,7 +90,7 @@ class ContactDual:
         state: State,
         rows: Rows,
         pairs: Incoming,
-        response: Callable[[ContactDual], Launch],
+        response: Response,
         *,
         step_size: Any,
         node_start: Any,
@@ -117,12 +132,10 @@ class ContactDual:
     def launches(self) -> list[Launch | Call | Repeat]:
         """Begin, lists and the repeated updates of one solve."""
         self._allocate()
-        repeated: list[Launch | Call] = [self._step(), self.response(self), self._balance()]
-        return [
-            self._begin(),
-            self._lists(),
-            Repeat("dual", repeated, self.going, self.most + 3),
-        ]
+        before = [self._begin(), self._lists(), *self.response.begin(self)]
+        update: list[Launch | Call] = [self._step(), self.response.repeat(self), self._balance()]
+        repeat = Repeat("dual", update, self.going, self.most + 3)
+        return [*before, repeat, *self.response.end(self)]
 
     def _begin(self) -> Launch:
         model, rows = self.model, self.rows
@@ -216,13 +229,15 @@ class ContactDual:
             rows.row_force,
             self.row_change,
             self.node_shift,
+            self.response.row_end,
+            self.response.end_move,
             self.row_balance,
             self.sums,
             self.best,
             self.control,
             self.going,
         ]
-        kernel = make_dual_balance(self.model.precision.name, self.law.kind)
+        kernel = make_dual_balance(self.model.precision.name, self.law.kind, self.response.by_ends)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------
