@@ -256,6 +256,16 @@ def test_frozen_rods_do_not_move(start: Start) -> None:
     assert (stuck.updates, stuck.fault) == (0, 0.0)
 
 
+def test_sums_that_are_folded(start: Start) -> None:
+    """Many chunks, as on CUDA, change nothing but the rounding of the sums."""
+    rods = Rods(start)
+    few = rods.solve(most=6, tolerance=0.0)
+    many = rods.solve(most=6, tolerance=0.0, chunks=(500, 7))
+    assert "fold_sums" in [x.name for x in many.dual.launches()[-1].launches]
+    assert np.abs(few.force - many.force).max() < 1e-9 * few.force.max()
+    assert rods.solve(chunks=(500, 7)).fault < FAULT
+
+
 def test_launches_timed_apart(start: Start) -> None:
     """Replaying launch by launch repeats as often, and names every launch."""
     rods = Rods(start)

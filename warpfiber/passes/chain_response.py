@@ -17,7 +17,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
 
-BLOCK_SHARE = 32  # numbers per end in `block`: ends that a fiber may have on average
+BLOCK_SHARE = 32
 
 
 @cache
@@ -145,11 +145,20 @@ class ChainResponse:
     """The response of a cell of flexible fibers; `ContactDual` takes an instance.
 
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
+    block_share: numbers per end in `block`, the ends that a fiber may have on average.
     """
 
     by_ends = True
 
-    def __init__(self, model: Model, rows: Any, row_stride: int, tension: Any) -> None:
+    def __init__(
+        self,
+        model: Model,
+        rows: Any,
+        row_stride: int,
+        tension: Any,
+        block_share: int = BLOCK_SHARE,
+    ) -> None:
+        self.block_share = block_share
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
         self.node_push = self._array(nodes, p.vec3)
@@ -168,7 +177,7 @@ class ChainResponse:
         self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
         self.end_known = self._array(ends, wp.uint8)
         self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
-        self.block = self._array(BLOCK_SHARE * ends, real)
+        self.block = self._array(self.block_share * ends, real)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
         """Ends and blocks of every fiber, for rows of the present capacity."""

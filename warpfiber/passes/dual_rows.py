@@ -215,3 +215,33 @@ def make_dual_balance(name: str, law: str, by_ends: bool):
         sums[wp.static(SUMS) * chunk + 3] = wp.float64(worst)
 
     return dual_balance
+
+
+@cache
+def make_fold_sums():
+    """Kernel `fold_sums`: the sums of many chunks as those of `folds` runs of them."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def fold_sums(
+        chunks: wp.int32,
+        folds: wp.int32,
+        sums: wp.array(dtype=wp.float64),
+        control: wp.array(dtype=wp.int32),
+        folded: wp.array(dtype=wp.float64),
+    ):
+        if control[wp.static(PHASE)] != wp.static(GO):
+            return
+        fold = wp.tid()
+        total = wp.vec3d()
+        worst = wp.float64(0.0)
+        for k in range(rows_begin(chunks, fold, folds), rows_begin(chunks, fold + 1, folds)):
+            at = wp.static(SUMS) * k
+            total += wp.vec3d(sums[at], sums[at + 1], sums[at + 2])
+            worst = wp.max(worst, sums[at + 3])
+        at = wp.static(SUMS) * fold
+        folded[at] = total[0]
+        folded[at + 1] = total[1]
+        folded[at + 2] = total[2]
+        folded[at + 3] = worst
+
+    return fold_sums

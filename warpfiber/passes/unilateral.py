@@ -20,11 +20,13 @@ from warpfiber.passes.dual_rows import (
     SUMS,
     make_dual_balance,
     make_dual_step,
+    make_fold_sums,
 )
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.executor import Call, Launch, Repeat
 
 ROW_CHUNKS = 16  # runs of rows on the CPU: enough for the workers, few sums to add
+CUDA_CHUNKS = 16384, 32  # on CUDA, where their sums are folded before they are added
 MOST_UPDATES = 200
 
 
@@ -98,6 +100,7 @@ class ContactDual:
         law: ContactLaw | None = None,
         most: int = MOST_UPDATES,
         fiber_frozen: Any = None,
+        chunks: tuple[int, int] | None = None,
     ) -> None:
         self.model, self.state, self.rows, self.pairs = model, state, rows, pairs
         self.response = response
@@ -110,8 +113,13 @@ class ContactDual:
         self.fiber_frozen = fiber_frozen if self.has_frozen else none
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
         self.fiber_in = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
-        self.chunks = ROW_CHUNKS
+        # runs of rows, and of their sums (0: these are not folded)
+        on_cpu = device.startswith("cpu")
+        self.chunks, self.folds = chunks or ((ROW_CHUNKS, 0) if on_cpu else CUDA_CHUNKS)
         self.sums = wp.zeros(SUMS * self.chunks, dtype=wp.float64, device=device)
+        self.folded = self.sums
+        if self.folds:
+            self.folded = wp.zeros(SUMS * self.folds, dtype=wp.float64, device=device)
         self.best = wp.zeros(2, dtype=wp.float64, device=device)
         self.control = wp.zeros(CONTROL_SIZE, dtype=wp.int32, device=device)
         self.going = wp.zeros(1, dtype=wp.int32, device=device)
@@ -134,6 +142,9 @@ class ContactDual:
         self._allocate()
         before = [self._begin(), self._lists(), *self.response.begin(self)]
         update: list[Launch | Call] = [self._step(), self.response.repeat(self), self._balance()]
+        if self.folds:
+            inputs = [self.chunks, self.folds, self.sums, self.control, self.folded]
+            update.append(Launch("fold_sums", make_fold_sums(), self.folds, inputs))
         repeat = Repeat("dual", update, self.going, self.most + 3)
         return [*before, repeat, *self.response.end(self)]
 
@@ -201,7 +212,7 @@ class ContactDual:
             rows.row_compliance,
             self.row_weight,
             self.row_balance,
-            self.sums,
+            self.folded,
             rows.row_force,
             self.row_best,
             self.row_change,
