@@ -109,7 +109,7 @@ def make_end_kernels(name: str):
                 row_end[2 * r + 1] = e
                 r = row_next[r]
 
-    return end_count, end_scan, end_fill
+    return {"end_count": end_count, "end_scan": end_scan, "end_fill": end_fill}
 
 
 @cache

@@ -184,7 +184,7 @@ class ChainResponse:
         model, rows, status = self.model, dual.rows, dual.state.status
         self._allocate(2 * rows.row_i.shape[0])
         fibers = model.fiber_count
-        count, scan, fill = make_end_kernels(model.precision.name)
+        kernels = make_end_kernels(model.precision.name)
         lists = [rows.row_out_start, dual.fiber_in, dual.row_next]
         counted = [model.fiber_node_start, rows.row_count, *lists, self.end_start]
         scanned = [fibers, self.block.shape[0], status, self.end_start, self.block_start]
@@ -201,9 +201,9 @@ class ChainResponse:
             self.end_move,
         ]
         return [
-            Launch("end_count", count, fibers, counted, split=True, follows=True),
-            Launch("end_scan", scan, 1, scanned),
-            Launch("end_fill", fill, fibers, filled, split=True),
+            Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
+            Launch("end_scan", kernels["end_scan"], 1, scanned),
+            Launch("end_fill", kernels["end_fill"], fibers, filled, split=True),
         ]
 
     def _fibers(self, dual: ContactDual) -> list[Any]:
