@@ -5,7 +5,7 @@ Units: as in `cell`, a = eta = 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -113,7 +113,7 @@ class Solved:
 def solve_rows(
     sim: Simulation,
     rows: Sequence[FlatRow],
-    response: Callable[[ContactDual], Any],
+    response: Any,
     dt: float,
     *,
     workers: int = 1,
@@ -122,6 +122,7 @@ def solve_rows(
     most: int = 5000,
     repeats: int = 1,
     fiber_frozen: Any = None,
+    chunks: tuple[int, int] | None = None,
     arrays: RowArrays | None = None,
 ) -> Solved:
     """One solve of rows that are `in_order`, at the present positions; `repeats` the step."""
@@ -139,6 +140,7 @@ def solve_rows(
         law=law,
         most=most,
         fiber_frozen=fiber_frozen,
+        chunks=chunks,
     )
     executor = Executor(dual.launches(), model.device, workers)
     executor.run(repeats, lambda: False)

@@ -277,12 +277,6 @@ def row_dual(crowd: Crowd, compliance: float = 0.0) -> du.Dual:
     )
 
 
-def balanced(crowd: Crowd, force: Array, compliance: float = 0.0) -> tuple[Array, Array]:
-    """e of every row, and D/(D + C) of lubrication rows (1 of others) of the dense problem."""
-    dual = row_dual(crowd, compliance)
-    return du.row_balance(dual, force), force
-
-
 @pytest.mark.parametrize("form", ["compliant", "inextensible"])
 def test_contacts_of_chains(start: Start, form: str) -> None:
     """Every row keeps its sign conditions and displacements are those of Gauss-Seidel."""
@@ -311,7 +305,7 @@ def test_lubrication_rows_and_soft_contacts(start: Start, law: ContactLaw) -> No
     got = cell.chains.solve(rows, most=20000, law=law)
     assert got.fault < 1e-9
     soft = 1.0 / law.stiffness if law.stiffness else 0.0
-    balance, _ = balanced(cell, got.force, soft)
+    balance = du.row_balance(row_dual(cell, soft), got.force)
     wet = np.array([row.compliance > 0.0 for row in rows])
     assert (got.force[wet] < 0.0).any()
     assert (got.force[~wet] >= 0.0).all()
@@ -348,6 +342,25 @@ def test_apply(start: Start) -> None:
     assert np.abs(pulled - tension).max() < 1e-9 * np.abs(tension).max()
     faster = sim.state.node_velocity.numpy() - velocity
     assert np.abs(faster - 0.25 * shift / DT).max() < 1e-11
+
+
+def test_fibers_whose_block_has_no_room(start: Start) -> None:
+    """Some or all fibers solved in every update: the same but for rounding."""
+    cell = crowd(start, dense=False)
+    found = []
+    for share in (32, 6, 0):
+        method = cell.chains.sim.method
+        cell.chains.response = ChainResponse(
+            cell.chains.sim.model, method.rows, method.row_stride, method.tension, share
+        )
+        found.append(cell.chains.solve(cell.rows, most=6, tolerance=0.0))
+        direct = (cell.chains.response.block_start.numpy() < 0).sum()
+        fibers = int((np.diff(cell.chains.response.end_start.numpy()) > 0).sum())
+        assert direct == {32: 0, 0: fibers}.get(share, direct)
+        assert share != 6 or 0 < direct < fibers
+    for other in found[1:]:
+        assert np.abs(other.force - found[0].force).max() < 1e-9 * found[0].force.max()
+        assert np.abs(other.shift - found[0].shift).max() < 1e-11
 
 
 def test_fibers_that_nothing_pushes_stay(start: Start) -> None:

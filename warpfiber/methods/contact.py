@@ -10,9 +10,9 @@ Limits: first order in dt; frictionless.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -24,7 +24,7 @@ from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import KEEP, ContactRows
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch, Repeat
-from warpfiber.passes.unilateral import ContactDual, ContactLaw
+from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Scene
 
 OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
@@ -42,6 +42,13 @@ class StepArrays:
     step_size: Any  # (1,) float64
     rejected: Any  # (2,) int32: the step under way, and in all
     verdict: Any  # (2,) int32: verdict of the contacts, fiber that it is about
+
+
+class MovingResponse(Response, Protocol):
+    """A response that also moves the fibers by the solution."""
+
+    def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
+        """`carried`: share of the velocity of contact that the fibers take on."""
 
 
 def has_contact(scene: Scene) -> bool:
@@ -63,8 +70,7 @@ def contact_law(scene: Scene, model: Model) -> ContactLaw:
 class ImplicitContact:
     """Contacts of one method: list, rows, forces and what they say of the step.
 
-    `response(dual)` makes the launch from row forces to `node_shift`, `apply(dual)` the one that
-    moves the fibers by it.
+    `response`: from row forces to the motion of the fibers.
     """
 
     def __init__(
@@ -77,12 +83,11 @@ class ImplicitContact:
         flow_origin: np.ndarray,
         stretch: float,
         workers: int,
-        response: Callable[[ContactDual], Launch],
-        apply: Callable[[ContactDual], Launch],
+        response: MovingResponse,
         fiber_frozen: Any = None,
     ) -> None:
         self.scene, self.model, self.state, self.step = scene, model, state, step
-        self.apply, self.flow_origin = apply, flow_origin
+        self.response, self.flow_origin = response, flow_origin
         self.hard = scene.numerics.contact == "unilateral"
         radii = [row["radius"] for row in model.group_rows]
         reach = 2.0 * max(radii) + KEEP * min(radii)
@@ -140,7 +145,7 @@ class ImplicitContact:
         gate = [self.check.list_short, state.status, step.rejected]
         found.append(Launch("gate", verdict["gate_list"], 1, gate))
         for rows, dual in self.solves:
-            found += [*rows.launches(), *dual.launches(), self.apply(dual)]
+            found += [*rows.launches(), *dual.launches(), self.response.apply(dual, carried=1.0)]
         needs = [rows.row_need for rows, _ in self.solves]
         judge = [
             wp.float64(OVERLAP if self.hard else FINITE),

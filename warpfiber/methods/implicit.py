@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfiber.methods.contact import ImplicitContact, StepArrays, has_contact
+from warpfiber.methods.contact import ImplicitContact, MovingResponse, StepArrays, has_contact
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import EXPIRED, TORN, Model, State
@@ -26,7 +26,6 @@ from warpfiber.passes.step_control import (
     make_step_end,
     make_take_back,
 )
-from warpfiber.passes.unilateral import ContactDual
 from warpfiber.scene import Scene
 
 Launches = list[Launch | Call | Repeat]
@@ -62,7 +61,7 @@ class Implicit(Method):
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
         self.contact: ImplicitContact | None = None
 
-    def _make_contact(self) -> None:
+    def _make_contact(self, response: MovingResponse) -> None:
         """Contact, once the arrays of the method exist."""
         if not self.meets or self.model.segment_count < 2:
             return
@@ -83,8 +82,7 @@ class Implicit(Method):
             flow_origin=self.flow_origin,
             stretch=float(self._segment_stretch().max()),
             workers=self.workers,
-            response=self.response,
-            apply=self.apply,
+            response=response,
             fiber_frozen=wp.array(frozen, dtype=wp.uint8, device=model.device)
             if frozen.any()
             else None,
@@ -103,14 +101,6 @@ class Implicit(Method):
     @abstractmethod
     def motion(self) -> Launches:
         """Launches that move every fiber without contact and keep the start where asked to."""
-
-    @abstractmethod
-    def response(self, dual: ContactDual) -> Launch:
-        """From the row forces of a solve to `dual.node_shift`."""
-
-    @abstractmethod
-    def apply(self, dual: ContactDual) -> Launch:
-        """Moves the fibers by the solution of a solve."""
 
     def launches(self) -> Launches:
         """Begin, motion, contact and end of a step, and what a rejected one needs."""

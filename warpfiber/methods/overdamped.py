@@ -25,7 +25,6 @@ from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Executor, Launch
 from warpfiber.passes.held_nodes import make_carry_fibers
-from warpfiber.passes.unilateral import ContactDual
 from warpfiber.scene import Scene
 
 # Arrays that the next step depends on beside the State and those of every implicit method.
@@ -57,8 +56,7 @@ class Overdamped(Implicit):
         # the guess of the first step is the start: nothing is known of the velocity
         state.node_velocity.zero_()
         if self.meets:
-            self.chain_response = ChainResponse(model, self.rows, self.row_stride, self.tension)
-        self._make_contact()
+            self._make_contact(ChainResponse(model, self.rows, self.row_stride, self.tension))
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -71,14 +69,6 @@ class Overdamped(Implicit):
         if any(group.frozen for group in self.scene.fibers):
             found.append(self._carry())
         return found
-
-    def response(self, dual: ContactDual) -> Launch:
-        """Two solves with the factors of the second stage."""
-        return self.chain_response(dual)
-
-    def apply(self, dual: ContactDual) -> Launch:
-        """Positions, velocities and tensions by the solution."""
-        return self.chain_response.apply(dual, carried=1.0)
 
     def tensions(self) -> tuple[Any, Any]:
         """Tensions now and at the start of the step."""

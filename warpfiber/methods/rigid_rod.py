@@ -22,8 +22,7 @@ from warpfiber.methods.implicit import Implicit, Launches
 from warpfiber.model import Model, State
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step, rod_map
-from warpfiber.passes.rod_response import rod_apply_launch, rod_response_launch
-from warpfiber.passes.unilateral import ContactDual
+from warpfiber.passes.rod_response import RodResponse
 from warpfiber.scene import Fault, Scene, SceneError
 
 
@@ -41,21 +40,13 @@ class RigidRod(Implicit):
         self.shape_settling = wp.array(settling, dtype=wp.vec3d, device=model.device)
         shape = rod_map(model.precision.name)
         self.maps = wp.zeros(len(mu), dtype=shape, device=model.device)
-        self._make_contact()
+        self._make_contact(RodResponse(model))
 
     # -- the step ---------------------------------------------------------------------------------
 
     def motion(self) -> Launches:
         """Maps of the step, and the rods by them."""
         return [self._maps(), self._move()]
-
-    def response(self, dual: ContactDual) -> Launch:
-        """Center and direction of every rod by the forces on it."""
-        return rod_response_launch(dual)
-
-    def apply(self, dual: ContactDual) -> Launch:
-        """Rods by the solution, their lengths kept."""
-        return rod_apply_launch(dual, carried=1.0)
 
     def _maps(self) -> Launch:
         inputs = [

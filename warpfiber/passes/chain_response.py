@@ -1,84 +1,35 @@
-"""Motion of flexible fibers by forces on their contact rows, with the factors of the step.
+"""Contact forces on flexible fibers: their motion during the solve, and what the solution does.
 
-Source: the linear response of SDIRK2 to forces that are constant over the step, linearized where
-    its second stage is (`chain_solve`, block LDL^T factors in `rows`):
-        A y = h F,   A shift = h F + c (R + T) y,   h = chi dt,  c = (1 - chi)/chi
-    Soft modes move by dt F/R, stiff ones by F/K; a fiber of given length keeps it. The impulse of
-    the second solve over h is the tension that the forces cause.
-Symbols: F node forces, R drag, T resistance to turning, A = R + T + h (...) with the tension as an
-    unknown; v = D^-1 L^-1 (right side) of a node, vt of its impulse.
-Limits: T here takes segments at their rest length, which leaves the response symmetric.
+Source: `chain_reply`, the response of one fiber; during the solve by its blocks (`chain_blocks`).
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from warpfiber.laws.chain_terms import make_chain_terms
 from warpfiber.model import HALT, Model, precision
+from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
+from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import CHI
-from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
-from warpfiber.passes.elimination import elimination_row, make_sym_algebra
-from warpfiber.passes.executor import Launch
+from warpfiber.passes.elimination import elimination_row
+from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
+
+BLOCK_SHARE = 32
 
 
 @cache
 def make_chain_response(name: str, has_frozen: bool) -> Any:
-    """Kernel `chain_response`, one thread per fiber: forces gathered, two solves, shift."""
+    """Kernel `chain_response`, one thread per fiber: shift and tensions by the forces found."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
     Row = elimination_row(name)
-    drag_diagonal, _, _ = make_chain_terms(name)
-    sym_mul, _ = make_sym_algebra(name)
-    zero, one = real(0.0), real(1.0)
-    chi, again = real(CHI), real((1.0 - CHI) / CHI)
-
-    @wp.func
-    def gather(
-        fiber: wp.int32,
-        first: wp.int32,
-        segments: wp.int32,
-        row_out_start: wp.array(dtype=wp.int32),
-        fiber_in: wp.array(dtype=wp.int32),
-        row_next: wp.array(dtype=wp.int32),
-        row_j: wp.array(dtype=wp.int32),
-        row_s: wp.array(dtype=real),
-        row_t: wp.array(dtype=real),
-        row_normal: wp.array(dtype=vec3),
-        row_force: wp.array(dtype=real),
-        node_push: wp.array(dtype=vec3),
-    ) -> wp.bool:
-        """Forces of the rows on the nodes; whether there are any."""
-        r = fiber_in[fiber]
-        pushed = wp.bool(False)
-        behind = vec3()
-        for k in range(segments):
-            segment = first - fiber + k
-            here = behind
-            behind = vec3()
-            for own in range(row_out_start[segment], row_out_start[segment + 1]):
-                force = row_force[own]
-                if force != zero:
-                    pushed = True
-                    push = force * row_normal[own]
-                    here -= (one - row_s[own]) * push
-                    behind -= row_s[own] * push
-            while r >= 0 and row_j[wp.max(r, 0)] == segment:
-                force = row_force[r]
-                if force != zero:
-                    pushed = True
-                    push = force * row_normal[r]
-                    here += (one - row_t[r]) * push
-                    behind += row_t[r] * push
-                r = row_next[r]
-            node_push[first + k] = here
-        node_push[first + segments] = behind
-        return pushed
+    chain_reply = make_chain_reply(name)
+    gather_push = make_gather_push(name)
+    zero = real(0.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def chain_response(
@@ -98,25 +49,20 @@ def make_chain_response(name: str, has_frozen: bool) -> Any:
         row_t: wp.array(dtype=real),
         row_normal: wp.array(dtype=vec3),
         row_force: wp.array(dtype=real),
-        control: wp.array(dtype=wp.int32),
+        end_start: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
         node_push: wp.array(dtype=vec3),
         node_reply: wp.array(dtype=vec3),
         reply_impulse: wp.array(dtype=real),
         segment_impulse: wp.array(dtype=real),
         node_shift: wp.array(dtype=vec3),
     ):
-        if control[wp.static(NEXT_PHASE)] == wp.static(DONE):
-            return
         fiber = wp.tid() + offset
+        if status[wp.static(HALT)] != 0 or end_start[fiber] == end_start[fiber + 1]:
+            return
         first = fiber_node_start[fiber]
         segments = fiber_node_start[fiber + 1] - first - 1
-        begin = row_out_start[first - fiber]
-        if begin == row_out_start[first - fiber + segments] and fiber_in[fiber] < 0:
-            return
-        if wp.static(has_frozen):
-            if fiber_frozen[fiber] != wp.uint8(0):
-                return
-        pushed = gather(
+        pushed = gather_push(
             fiber,
             first,
             segments,
@@ -130,91 +76,28 @@ def make_chain_response(name: str, has_frozen: bool) -> Any:
             row_force,
             node_push,
         )
+        if wp.static(has_frozen):
+            pushed = pushed and fiber_frozen[fiber] == wp.uint8(0)
         if not pushed:
             for i in range(first, first + segments + 1):
                 node_shift[i] = vec3()
             for segment in range(first - fiber, first - fiber + segments):
                 segment_impulse[segment] = zero
             return
-        g = groups[fiber_group[fiber]]
-        h = chi * real(step_size[0])
-        base = row_stride * fiber
-        kappa = h * g.bending / (g.rest * g.rest)
-        drag_end = again * g.drag * drag_diagonal(g.spacing, 0, segments)
-        drag_inner = again * g.drag * drag_diagonal(g.spacing, 1, 2)
-        drag_off = again * g.drag * g.coupling
-        strength = again * g.torque / (g.rest * g.rest)
-        for stage in range(2):
-            # Forward: r, then v = D^-1 L^-1 r; z0, z1, z2 are the displacements of stage 0 of the
-            # nodes k - 1, k, k + 1, couple that of the segment before node k on it.
-            y1 = vec3()
-            yt1 = zero
-            v1 = vec3()
-            v2 = vec3()
-            n_before = vec3()
-            couple = vec3()
-            z0 = vec3()
-            z1 = vec3()
-            if stage == 1:
-                z1 = node_reply[first]
-            for k in range(segments + 1):
-                i = first + k
-                row = rows[base + k]
-                r = h * node_push[i]
-                if stage == 1:
-                    drag = drag_inner
-                    if k == 0 or k == segments:
-                        drag = drag_end
-                    r += drag * z1 + drag_off * z0 + couple
-                    if k < segments:
-                        z2 = node_reply[i + 1]
-                        weight = g.weight
-                        if k == 0:
-                            weight += g.weight_excess
-                        if k == segments - 1:
-                            weight += g.weight_excess
-                        turn = z2 - z1
-                        couple = (strength * weight) * (turn - wp.dot(row.axis, turn) * row.axis)
-                        r += drag_off * z2 - couple
-                        z0 = z1
-                        z1 = z2
-                y = r - vec3(wp.dot(row.l0, y1), wp.dot(row.l1, y1), wp.dot(row.l2, y1))
-                y -= yt1 * row.lt + kappa * v2
-                yt = wp.dot(n_before, v1)
-                v2 = v1
-                v1 = sym_mul(row.diagonal, row.off, y) + yt * row.q
-                node_reply[i] = v1
-                reply_impulse[i] = wp.dot(row.q, y) + yt * row.s
-                y1 = y
-                yt1 = yt
-                n_before = row.axis
-            # Backward, as in the step itself.
-            z1 = vec3()
-            z2 = vec3()
-            l0 = vec3()
-            l1 = vec3()
-            l2 = vec3()
-            lt = vec3()
-            impulse = zero
-            for at in range(segments + 1):
-                i = first + segments - at
-                row = rows[base + segments - at]
-                push = impulse * row.axis - kappa * z2
-                z = node_reply[i] + sym_mul(row.diagonal, row.off, push)
-                z -= z1[0] * l0 + z1[1] * l1 + z1[2] * l2
-                impulse = reply_impulse[i] + wp.dot(row.q, push) - wp.dot(lt, z1)
-                l0 = row.l0
-                l1 = row.l1
-                l2 = row.l2
-                lt = row.lt
-                z2 = z1
-                z1 = z
-                if stage == 0:
-                    node_reply[i] = z
-                else:
-                    node_shift[i] = z
-                    if at < segments:
-                        segment_impulse[i - fiber - 1] = impulse
+        chain_reply(
+            fiber,
+            first,
+            segments,
+            row_stride * fiber,
+            real(step_size[0]),
+            groups[fiber_group[fiber]],
+            rows,
+            node_push,
+            node_reply,
+            reply_impulse,
+            segment_impulse,
+            node_shift,
+        )
 
     return chain_response
 
@@ -235,9 +118,7 @@ def make_chain_apply(name: str) -> Any:
         carried: real,
         step_size: wp.array(dtype=wp.float64),
         fiber_node_start: wp.array(dtype=wp.int32),
-        row_out_start: wp.array(dtype=wp.int32),
-        fiber_in: wp.array(dtype=wp.int32),
-        row_count: wp.array(dtype=wp.int32),
+        end_start: wp.array(dtype=wp.int32),
         node_shift: wp.array(dtype=vec3),
         segment_impulse: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
@@ -245,14 +126,11 @@ def make_chain_apply(name: str) -> Any:
         node_velocity: wp.array(dtype=vec3),
         tension: wp.array(dtype=real),
     ):
-        if status[wp.static(HALT)] != 0 or row_count[0] == 0:
-            return
         fiber = wp.tid() + offset
+        if status[wp.static(HALT)] != 0 or end_start[fiber] == end_start[fiber + 1]:
+            return
         first = fiber_node_start[fiber]
         last = fiber_node_start[fiber + 1] - 1
-        begin = row_out_start[first - fiber]
-        if begin == row_out_start[last - fiber] and fiber_in[fiber] < 0:
-            return
         dt = real(step_size[0])
         for i in range(first, last + 1):
             node_pos[i] = node_pos[i] + node_shift[i]
@@ -263,29 +141,74 @@ def make_chain_apply(name: str) -> Any:
     return chain_apply
 
 
-@dataclass
 class ChainResponse:
     """The response of a cell of flexible fibers; `ContactDual` takes an instance.
 
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
+    block_share: numbers per end in `block`, the ends that a fiber may have on average.
     """
 
-    model: Model
-    rows: Any
-    row_stride: int
-    tension: Any
+    by_ends = True
 
-    def __post_init__(self) -> None:
-        model, p, device = self.model, self.model.precision, self.model.device
-        self.node_push = wp.zeros(model.node_count, dtype=p.vec3, device=device)
-        self.node_reply = wp.zeros(model.node_count, dtype=p.vec3, device=device)
-        self.reply_impulse = wp.zeros(model.node_count, dtype=p.real, device=device)
-        self.segment_impulse = wp.zeros(model.segment_count, dtype=p.real, device=device)
+    def __init__(
+        self,
+        model: Model,
+        rows: Any,
+        row_stride: int,
+        tension: Any,
+        block_share: int = BLOCK_SHARE,
+    ) -> None:
+        self.block_share = block_share
+        self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
+        p, nodes = model.precision, model.node_count
+        self.node_push = self._array(nodes, p.vec3)
+        self.node_reply = self._array(nodes, p.vec3)
+        self.reply_impulse = self._array(nodes, p.real)
+        self.segment_impulse = self._array(model.segment_count, p.real)
+        self.end_start = self._array(model.fiber_count + 1, wp.int32)
+        self.block_start = self._array(model.fiber_count, wp.int32)
+        self._allocate(0)
 
-    def __call__(self, dual: ContactDual) -> Launch:
-        """The launch that makes `node_shift` of the row forces."""
-        model, rows = dual.model, dual.rows
-        inputs = [
+    def _array(self, size: int, dtype: Any) -> Any:
+        return wp.zeros(size, dtype=dtype, device=self.model.device)
+
+    def _allocate(self, ends: int) -> None:
+        real = self.model.precision.real
+        self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
+        self.end_known = self._array(ends, wp.uint8)
+        self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
+        self.block = self._array(self.block_share * ends, real)
+
+    def begin(self, dual: ContactDual) -> list[Launch | Call]:
+        """Ends and blocks of every fiber, for rows of the present capacity."""
+        model, rows, status = self.model, dual.rows, dual.state.status
+        self._allocate(2 * rows.row_i.shape[0])
+        fibers = model.fiber_count
+        kernels = make_end_kernels(model.precision.name)
+        lists = [rows.row_out_start, dual.fiber_in, dual.row_next]
+        counted = [model.fiber_node_start, rows.row_count, *lists, self.end_start]
+        scanned = [fibers, self.block.shape[0], status, self.end_start, self.block_start]
+        filled = [
+            model.fiber_node_start,
+            *lists,
+            rows.row_j,
+            self.end_start,
+            status,
+            self.row_end,
+            self.end_row,
+            self.end_known,
+            self.end_force,
+            self.end_move,
+        ]
+        return [
+            Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
+            Launch("end_scan", kernels["end_scan"], 1, scanned),
+            Launch("end_fill", kernels["end_fill"], fibers, filled, split=True),
+        ]
+
+    def _fibers(self, dual: ContactDual) -> list[Any]:
+        model = self.model
+        return [
             self.row_stride,
             dual.step_size,
             model.groups,
@@ -293,34 +216,54 @@ class ChainResponse:
             model.fiber_group,
             dual.fiber_frozen,
             self.rows,
-            rows.row_out_start,
+            dual.rows.row_out_start,
             dual.fiber_in,
             dual.row_next,
-            rows.row_j,
-            rows.row_s,
-            rows.row_t,
-            rows.row_normal,
-            rows.row_force,
-            dual.control,
-            self.node_push,
-            self.node_reply,
-            self.reply_impulse,
-            self.segment_impulse,
-            dual.node_shift,
+            dual.rows.row_j,
         ]
+
+    def _rows(self, dual: ContactDual) -> list[Any]:
+        rows = dual.rows
+        return [rows.row_s, rows.row_t, rows.row_normal, rows.row_force, self.end_start]
+
+    def _work(self, dual: ContactDual) -> list[Any]:
+        made = [self.reply_impulse, self.segment_impulse, dual.node_shift]
+        return [self.node_push, self.node_reply, *made]
+
+    def repeat(self, dual: ContactDual) -> Launch:
+        """Motion of the ends of all rows."""
+        model = self.model
+        inputs = [
+            *self._fibers(dual),
+            dual.row_node,
+            *self._rows(dual),
+            self.block_start,
+            self.end_row,
+            dual.control,
+            *self._work(dual),
+            self.block,
+            self.end_known,
+            self.end_force,
+            self.end_move,
+        ]
+        kernel = make_chain_moves(model.precision.name, dual.has_frozen)
+        return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
+
+    def end(self, dual: ContactDual) -> list[Launch | Call]:
+        """Shift and tensions of the solution."""
+        model = self.model
+        inputs = [*self._fibers(dual), *self._rows(dual), dual.state.status, *self._work(dual)]
         kernel = make_chain_response(model.precision.name, dual.has_frozen)
-        return Launch("chain_response", kernel, model.fiber_count, inputs, split=True)
+        return [Launch("chain_response", kernel, model.fiber_count, inputs, split=True)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
-        """Moves the fibers by the solution."""
-        model, state = dual.model, dual.state
+        """Moves the fibers by the solution and adds its tensions."""
+        model, state = self.model, dual.state
         inputs = [
             carried,
             dual.step_size,
             model.fiber_node_start,
-            dual.rows.row_out_start,
-            dual.fiber_in,
-            dual.rows.row_count,
+            self.end_start,
             dual.node_shift,
             self.segment_impulse,
             state.status,
@@ -332,6 +275,7 @@ class ChainResponse:
         return Launch("chain_apply", kernel, model.fiber_count, inputs, split=True)
 
 
-def bytes_per_node(real: int) -> int:
-    """Bytes per node of the arrays of `ChainResponse`, for reals of `real` bytes."""
-    return 8 * real
+def chain_response_bytes(nodes: int, segments: int, rows: int, real: int) -> int:
+    """Bytes of the arrays of `ChainResponse`, for reals of `real` bytes."""
+    per_row = 2 * (8 + 1 + (2 + BLOCK_SHARE) * real)
+    return nodes * 7 * real + segments * real + rows * per_row

@@ -118,8 +118,11 @@ def make_dual_step(name: str):
 
 
 @cache
-def make_dual_balance(name: str, law: str):
-    """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step."""
+def make_dual_balance(name: str, law: str, by_ends: bool):
+    """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
+
+    `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     opening, _ = make_contact_compliance(name, law)
@@ -144,6 +147,8 @@ def make_dual_balance(name: str, law: str):
         row_force: wp.array(dtype=real),
         row_change: wp.array(dtype=real),
         node_shift: wp.array(dtype=vec3),
+        row_end: wp.array(dtype=wp.int32),
+        end_move: wp.array(dtype=real),
         row_balance: wp.array(dtype=real),
         sums: wp.array(dtype=wp.float64),
         best: wp.array(dtype=wp.float64),
@@ -166,13 +171,19 @@ def make_dual_balance(name: str, law: str):
         turned = wp.float64(0.0)
         worst = real(0.0)
         for r in range(rows_begin(count, chunk, chunks), rows_begin(count, chunk + 1, chunks)):
-            node = row_node[r]
-            s = row_s[r]
-            move = -(one - s) * node_shift[node[0]] - s * node_shift[node[0] + 1]
-            if node[1] >= 0:
-                t = row_t[r]
-                move += (one - t) * node_shift[node[1]] + t * node_shift[node[1] + 1]
-            e = row_base[r] + wp.dot(row_normal[r], move)
+            e = row_base[r]
+            if wp.static(by_ends):
+                e += end_move[row_end[2 * r]]
+                if row_end[2 * r + 1] >= 0:
+                    e += end_move[row_end[2 * r + 1]]
+            else:
+                node = row_node[r]
+                s = row_s[r]
+                move = -(one - s) * node_shift[node[0]] - s * node_shift[node[0] + 1]
+                if node[1] >= 0:
+                    t = row_t[r]
+                    move += (one - t) * node_shift[node[1]] + t * node_shift[node[1] + 1]
+                e += wp.dot(row_normal[r], move)
             force = row_force[r]
             soft = row_compliance[r]
             weight = row_weight[r]
@@ -204,3 +215,33 @@ def make_dual_balance(name: str, law: str):
         sums[wp.static(SUMS) * chunk + 3] = wp.float64(worst)
 
     return dual_balance
+
+
+@cache
+def make_fold_sums():
+    """Kernel `fold_sums`: the sums of many chunks as those of `folds` runs of them."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def fold_sums(
+        chunks: wp.int32,
+        folds: wp.int32,
+        sums: wp.array(dtype=wp.float64),
+        control: wp.array(dtype=wp.int32),
+        folded: wp.array(dtype=wp.float64),
+    ):
+        if control[wp.static(PHASE)] != wp.static(GO):
+            return
+        fold = wp.tid()
+        total = wp.vec3d()
+        worst = wp.float64(0.0)
+        for k in range(rows_begin(chunks, fold, folds), rows_begin(chunks, fold + 1, folds)):
+            at = wp.static(SUMS) * k
+            total += wp.vec3d(sums[at], sums[at + 1], sums[at + 2])
+            worst = wp.max(worst, sums[at + 3])
+        at = wp.static(SUMS) * fold
+        folded[at] = total[0]
+        folded[at + 1] = total[1]
+        folded[at + 2] = total[2]
+        folded[at + 3] = worst
+
+    return fold_sums

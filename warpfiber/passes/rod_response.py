@@ -12,9 +12,9 @@ from functools import cache
 import warp as wp
 
 from warpfiber.laws.rod_mobility import make_rod_mobility
-from warpfiber.model import HALT, precision
+from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
-from warpfiber.passes.executor import Launch
+from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
 
@@ -126,41 +126,57 @@ def make_rod_apply(name: str):
     return rod_apply
 
 
-def rod_response_launch(dual: ContactDual) -> Launch:
-    """The response of a cell of rods; `ContactDual` takes this function."""
-    model, rows = dual.model, dual.rows
-    inputs = [
-        dual.step_size,
-        model.groups,
-        model.fiber_group,
-        dual.fiber_frozen,
-        dual.node_start,
-        rows.row_out_start,
-        dual.fiber_in,
-        dual.row_next,
-        rows.row_s,
-        rows.row_t,
-        rows.row_normal,
-        rows.row_force,
-        dual.control,
-        dual.node_shift,
-    ]
-    kernel = make_rod_response(model.precision.name, dual.has_frozen)
-    return Launch("rod_response", kernel, model.fiber_count, inputs, split=True)
+class RodResponse:
+    """The response of a cell of rods; `ContactDual` takes an instance."""
 
+    by_ends = False
 
-def rod_apply_launch(dual: ContactDual, carried: float = 0.0) -> Launch:
-    """Moves the rods by the solution."""
-    model, state = dual.model, dual.state
-    inputs = [
-        carried,
-        dual.step_size,
-        model.groups,
-        model.fiber_group,
-        dual.node_shift,
-        state.status,
-        state.node_pos,
-        state.node_velocity,
-    ]
-    kernel = make_rod_apply(model.precision.name)
-    return Launch("rod_apply", kernel, model.fiber_count, inputs, split=True)
+    def __init__(self, model: Model) -> None:
+        self.row_end = wp.zeros(0, dtype=wp.int32, device=model.device)
+        self.end_move = wp.zeros(0, dtype=model.precision.real, device=model.device)
+
+    def begin(self, dual: ContactDual) -> list[Launch | Call]:
+        """Nothing."""
+        return []
+
+    def end(self, dual: ContactDual) -> list[Launch | Call]:
+        """Nothing: the last update leaves the shift."""
+        return []
+
+    def repeat(self, dual: ContactDual) -> Launch:
+        """Forces gathered and shifts of both ends."""
+        model, rows = dual.model, dual.rows
+        inputs = [
+            dual.step_size,
+            model.groups,
+            model.fiber_group,
+            dual.fiber_frozen,
+            dual.node_start,
+            rows.row_out_start,
+            dual.fiber_in,
+            dual.row_next,
+            rows.row_s,
+            rows.row_t,
+            rows.row_normal,
+            rows.row_force,
+            dual.control,
+            dual.node_shift,
+        ]
+        kernel = make_rod_response(model.precision.name, dual.has_frozen)
+        return Launch("rod_response", kernel, model.fiber_count, inputs, split=True)
+
+    def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
+        """Moves the rods by the solution."""
+        model, state = dual.model, dual.state
+        inputs = [
+            carried,
+            dual.step_size,
+            model.groups,
+            model.fiber_group,
+            dual.node_shift,
+            state.status,
+            state.node_pos,
+            state.node_velocity,
+        ]
+        kernel = make_rod_apply(model.precision.name)
+        return Launch("rod_apply", kernel, model.fiber_count, inputs, split=True)

@@ -8,7 +8,6 @@ Limits: the response is linear in the forces and symmetric; see `rod_response`, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,11 +20,13 @@ from warpfiber.passes.dual_rows import (
     SUMS,
     make_dual_balance,
     make_dual_step,
+    make_fold_sums,
 )
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.executor import Call, Launch, Repeat
 
 ROW_CHUNKS = 16  # runs of rows on the CPU: enough for the workers, few sums to add
+CUDA_CHUNKS = 16384, 32  # on CUDA, where their sums are folded before they are added
 MOST_UPDATES = 200
 
 
@@ -53,6 +54,23 @@ class Incoming(Protocol):
     in_pair: Any
 
 
+class Response(Protocol):
+    """How fibers move by the forces of the rows: `rod_response`, `chain_response`."""
+
+    by_ends: bool  # it makes `row_end` and `end_move`, see `dual_rows.make_dual_balance`
+    row_end: Any
+    end_move: Any
+
+    def begin(self, dual: ContactDual) -> list[Launch | Call]:
+        """Launches after the lists of the fibers."""
+
+    def repeat(self, dual: ContactDual) -> Launch:
+        """The motion by the present forces, in every update."""
+
+    def end(self, dual: ContactDual) -> list[Launch | Call]:
+        """Launches that leave `node_shift` of the solution."""
+
+
 @dataclass(frozen=True)
 class ContactLaw:
     """`hard`, `linear` (stiffness) or `exponential` (strength and decay), in run units."""
@@ -65,8 +83,7 @@ class ContactLaw:
 class ContactDual:
     """Solves for `rows.row_force` and leaves the response of the fibers in `node_shift`.
 
-    `response(dual)` is the launch that makes `node_shift` of the row forces. Arrays as long as the
-    rows are made by `launches`, so call it again when the rows grow.
+    Arrays as long as the rows are made by `launches`, so call it again when the rows grow.
     """
 
     def __init__(
@@ -75,7 +92,7 @@ class ContactDual:
         state: State,
         rows: Rows,
         pairs: Incoming,
-        response: Callable[[ContactDual], Launch],
+        response: Response,
         *,
         step_size: Any,
         node_start: Any,
@@ -83,6 +100,7 @@ class ContactDual:
         law: ContactLaw | None = None,
         most: int = MOST_UPDATES,
         fiber_frozen: Any = None,
+        chunks: tuple[int, int] | None = None,
     ) -> None:
         self.model, self.state, self.rows, self.pairs = model, state, rows, pairs
         self.response = response
@@ -95,8 +113,13 @@ class ContactDual:
         self.fiber_frozen = fiber_frozen if self.has_frozen else none
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
         self.fiber_in = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
-        self.chunks = ROW_CHUNKS
+        # runs of rows, and of their sums (0: these are not folded)
+        on_cpu = device.startswith("cpu")
+        self.chunks, self.folds = chunks or ((ROW_CHUNKS, 0) if on_cpu else CUDA_CHUNKS)
         self.sums = wp.zeros(SUMS * self.chunks, dtype=wp.float64, device=device)
+        self.folded = self.sums
+        if self.folds:
+            self.folded = wp.zeros(SUMS * self.folds, dtype=wp.float64, device=device)
         self.best = wp.zeros(2, dtype=wp.float64, device=device)
         self.control = wp.zeros(CONTROL_SIZE, dtype=wp.int32, device=device)
         self.going = wp.zeros(1, dtype=wp.int32, device=device)
@@ -117,12 +140,13 @@ class ContactDual:
     def launches(self) -> list[Launch | Call | Repeat]:
         """Begin, lists and the repeated updates of one solve."""
         self._allocate()
-        repeated: list[Launch | Call] = [self._step(), self.response(self), self._balance()]
-        return [
-            self._begin(),
-            self._lists(),
-            Repeat("dual", repeated, self.going, self.most + 3),
-        ]
+        before = [self._begin(), self._lists(), *self.response.begin(self)]
+        update: list[Launch | Call] = [self._step(), self.response.repeat(self), self._balance()]
+        if self.folds:
+            inputs = [self.chunks, self.folds, self.sums, self.control, self.folded]
+            update.append(Launch("fold_sums", make_fold_sums(), self.folds, inputs))
+        repeat = Repeat("dual", update, self.going, self.most + 3)
+        return [*before, repeat, *self.response.end(self)]
 
     def _begin(self) -> Launch:
         model, rows = self.model, self.rows
@@ -188,7 +212,7 @@ class ContactDual:
             rows.row_compliance,
             self.row_weight,
             self.row_balance,
-            self.sums,
+            self.folded,
             rows.row_force,
             self.row_best,
             self.row_change,
@@ -216,13 +240,15 @@ class ContactDual:
             rows.row_force,
             self.row_change,
             self.node_shift,
+            self.response.row_end,
+            self.response.end_move,
             self.row_balance,
             self.sums,
             self.best,
             self.control,
             self.going,
         ]
-        kernel = make_dual_balance(self.model.precision.name, self.law.kind)
+        kernel = make_dual_balance(self.model.precision.name, self.law.kind, self.response.by_ends)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------
