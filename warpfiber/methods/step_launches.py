@@ -78,7 +78,7 @@ def _has_native_nodes(chain: BeadChain) -> bool:
 
 
 def pair_launch(chain: BeadChain) -> Launch:
-    """Forces of all listed pairs: by blocks of pairs on the CPU, else by segments."""
+    """Forces of all listed pairs: by blocks of pairs on the CPU, else one by one."""
     model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     assert pairs is not None
     inputs = [
@@ -93,7 +93,7 @@ def pair_launch(chain: BeadChain) -> Launch:
         model.segment_fiber,
         state.gradient,
         state.lattice_now,
-        pairs.pair_i if chain.native else pairs.out_start,
+        pairs.pair_i,
         pairs.pair_j,
         pairs.pair_image,
         state.node_pos,
@@ -110,7 +110,7 @@ def pair_launch(chain: BeadChain) -> Launch:
         chunks = native_chunks(model.segment_count)
         return Launch("pairs", kernel, chunks, [chunks, *inputs], split=True)
     kernel = make_pair_sweep(p.name, chain.pair_features)
-    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
+    return Launch("pairs", kernel, pairs.pair_capacity, inputs, split=True)
 
 
 def _lubrication_dt(chain: BeadChain) -> float:
