@@ -297,6 +297,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                 row.diagonal = pd
                 row.off = po
                 row.q = q
+                row.s = s
                 row.l0 = l0
                 row.l1 = l1
                 row.l2 = l2
