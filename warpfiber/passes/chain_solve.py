@@ -287,9 +287,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                         time, image = wp.where(from_velocity, h, dt), fiber_image[fiber]
                         V = held_velocity(node_load[i], gradient, lattice[0], image, time)
                         v = h * V - w0
-                        pd = nothing
-                        po = nothing
-                        q = nothing
+                        pd, po, q = nothing, nothing, nothing
                         s = held_impulse(slack)
                         vt = s * (yt - wp.dot(along, v))
 
