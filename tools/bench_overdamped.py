@@ -157,7 +157,8 @@ def _ratio(
     """
     density, strains = EQUAL_ERROR[modulus]
     fiber = {"fibers.0.youngs_modulus": modulus}
-    cases = {"bead_chain": fiber | {"fibers.0.density": density, "numerics.dt_fraction": 0.9}}
+    explicit = {"numerics.method": "bead_chain", "numerics.dt_fraction": 0.9}
+    cases = {"bead_chain": fiber | explicit | {"fibers.0.density": density}}
     implicit = fiber | {"numerics.method": "overdamped"}
     for name in SOLVES:
         cases[name] = implicit | {"numerics.integrator": name, "numerics.strain_step": STEPS[0]}
