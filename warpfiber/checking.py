@@ -11,7 +11,7 @@ from warpfiber.methods.overdamped import overdamped_bytes
 from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.methods.strain_steps import LARGEST_STRAIN
-from warpfiber.passes.neighbors import CELL_SLACK, FIRST_STRETCH
+from warpfiber.passes.neighbors import FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
     bead_count,
@@ -68,7 +68,7 @@ def box_strain_limit(scene: Scene) -> float:
         return math.inf
     diameter = max(group.diameter for group in scene.fibers)
     skin = START_SKIN * diameter if scene.numerics.skin is None else scene.numerics.skin
-    longest = CELL_SLACK * FIRST_STRETCH * longest_segment(scene)
+    longest = FIRST_STRETCH * longest_segment(scene)
     return bearable_strain(scene, longest + contact_reach(scene) * diameter + skin)
 
 
@@ -145,7 +145,13 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     numerics = scene.numerics
     limits, dt = step_limits(scene), chosen_step(scene)
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
-    if numerics.method == "overdamped":
+    if scene.method_reason is not None:
+        rows.append(("chosen by auto", scene.method_reason))
+    if numerics.method == "rigid_rod":
+        rows.append(("dt limit", limits[0].term))
+        share = f" = strain {dt * scene.flow.rate:.3g}" if scene.flow and scene.flow.rate else ""
+        rows.append(("dt", f"{dt:.4g} s{share}"))
+    elif numerics.method == "overdamped":
         rows.append(("dt limit", f"none; a turn is followed up to a strain of {LARGEST_STRAIN}"))
         share = ""
         if math.isfinite(limits[0].dt):

@@ -125,8 +125,10 @@ class Job:
         bound = f" ({warning}limit {limit.dt:.4g} s, {limit.term})"
         if not math.isfinite(limit.dt):
             bound = ""
+        numerics, reason = self.scene.numerics, self.scene.method_reason
+        chosen = f"method {numerics.method} by auto ({reason}), " if reason else ""
         return (
-            f"{model.fiber_count} fibers, {model.segment_count} segments, "
+            f"{chosen}{model.fiber_count} fibers, {model.segment_count} segments, "
             f"dt {self.simulation.dt:.4g} s{bound}, "
             f"{self.scene.numerics.precision} on {self.simulation.device}, "
             f"workers {self.simulation.method.workers}"

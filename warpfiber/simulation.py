@@ -17,6 +17,7 @@ from warpfiber.build import build, realized_scene
 from warpfiber.methods.bead_chain import BeadChain
 from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
+from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -25,7 +26,11 @@ from warpfiber.scene import Fault, Scene, SceneError, Stage
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
 
-METHODS: dict[str, type[Method]] = {"bead_chain": BeadChain, "overdamped": Overdamped}
+METHODS: dict[str, type[Method]] = {
+    "bead_chain": BeadChain,
+    "overdamped": Overdamped,
+    "rigid_rod": RigidRod,
+}
 
 # What a checkpoint holds beside what the method saves: arrays that the next step depends on.
 _ARRAYS = (

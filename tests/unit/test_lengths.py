@@ -199,3 +199,27 @@ def test_histogram_file(tmp_path: Path) -> None:
     assert groups[0].length > 2 * 19e-6 and groups[-1].length > 3.9e-3
     first = groups[0].length_distribution
     assert first is not None and first.histogram is not None and len(first.histogram) == 3
+
+
+def test_loads_follow_their_table() -> None:
+    """A load on the table behind the split one is on the same fibers; on the split one refused."""
+    plain = {"diameter": 19e-6, "youngs_modulus": 3e10, "aspect_ratio": 10, "count": 2}
+    tables = plate_cell(numerics__method="overdamped", numerics__segment_length=[2e-4, 1e-4])
+    tables["fibers"].append(plain)
+    tables["contact"] = {}
+    tables["load"] = [{"group": 1, "fiber": 0, "node": 0, "force": [1e-6, 0, 0]}]
+    scene = split_tables(scene_from_dict(tables))
+    assert scene.loads[0].group == len(scene.fibers) - 1
+    assert scene.fibers[scene.loads[0].group].count == 2
+    tables["load"][0]["group"] = 0
+    with pytest.raises(SceneError) as caught:
+        split_tables(scene_from_dict(tables))
+    assert [fault.key for fault in caught.value.faults] == ["load.0.group"]
+
+
+def test_auto_takes_chains() -> None:
+    tables = plate_cell(numerics__method="auto")
+    tables["contact"] = {}
+    scene = scene_from_dict(tables)
+    assert scene.numerics.method == "overdamped"
+    assert scene.method_reason is not None and "packed as chains" in scene.method_reason

@@ -34,7 +34,9 @@ def split_tables(scene: Scene) -> Scene:
     """
     groups: list[FiberGroup] = []
     faults: list[Fault] = []
+    place: list[int] = []
     for index, group in enumerate(scene.fibers):
+        place.append(len(groups))
         if group.table is not None or (group.length_distribution is None and not group.layers):
             groups.append(group)
         elif group.length_distribution is None:
@@ -44,9 +46,14 @@ def split_tables(scene: Scene) -> Scene:
                 groups += _split(scene, index, group)
             except SceneError as error:
                 faults += error.faults
+    for row, load in enumerate(scene.loads):
+        if scene.fibers[load.group].length_distribution and scene.fibers[load.group].table is None:
+            remedy = "its fibers differ in length; load a table of fibers of one length"
+            faults.append(Fault(scene.path, f"load.{row}.group", load.group, remedy))
     if faults:
         raise SceneError(faults)
-    return dataclasses.replace(scene, fibers=tuple(groups))
+    loads = tuple(dataclasses.replace(load, group=place[load.group]) for load in scene.loads)
+    return dataclasses.replace(scene, fibers=tuple(groups), loads=loads)
 
 
 def table_law(scene: Scene, index: int, group: FiberGroup) -> LengthLaw:

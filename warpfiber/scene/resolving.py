@@ -162,6 +162,8 @@ def _resolve_segments(draft: Draft) -> None:
         group["segments"] = 0 if varied else None
     place = draft.given("numerics", SEGMENT_KEYS)
     key = place.rpartition(".")[2]
+    if draft.method == "rigid_rod" and draft.numerics[key] is None and not draft.is_given(place):
+        draft.numerics[key] = 1
     asked = draft.numerics[key]
     if asked is None:
         if draft.fibers and all(group["node_file"] is not None for group in draft.fibers):
@@ -177,7 +179,7 @@ def _resolve_segments(draft: Draft) -> None:
         return
     for index, (group, value) in enumerate(zip(draft.fibers, per_group, strict=True)):
         if group["node_file"] is not None:
-            group["segments"] = value if key == "segments" else 0
+            group["segments"] = value if draft.is_given("numerics.segments") else 0
         elif group["aspect_ratio"]:
             group["segments"] = _segments(draft, group, index, place, value)
 
@@ -225,6 +227,9 @@ def _resolve_contact(draft: Draft) -> None:
     flow = draft.flow_object
     if flow is None:
         return
+    if draft.numerics["contact"] == "unilateral" or contact["law"] == "linear":
+        contact["strength"] = 0.0  # has no meaning there
+        return
     if flow.rate == 0.0:
         remedy = "missing: no flow rate to set it; give N"
         if contact["law"] == "none":
@@ -257,6 +262,8 @@ def _resolve_dt(draft: Draft) -> None:
     for key in ("dt", "workers", "skin"):
         if numerics[key] == "auto":
             numerics[key] = None
+    if draft.method == "rigid_rod":  # nothing is solved, so neither has a meaning
+        numerics.update(integrator=None, tolerance=None)
     step, flow = numerics["strain_step"], draft.flow_object
     if step is None or flow is None:
         return

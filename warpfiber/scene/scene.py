@@ -90,7 +90,11 @@ class Numerics:
     """end_weighted, plain"""
     integrator: str | None = None
     contact: str
-    """penalty"""
+    """penalty, unilateral"""
+    contact_tolerance: float | None = None
+    """radii of the thinnest fiber, of the gaps of unilateral and implicit contact"""
+    linearizations: int | None = None
+    """of contact in a step: 1, or 2 to push against what the first left"""
     dt: float | None = None
     """s; None = auto. `strain_step` is already turned into it."""
     strain_step: float | None = None
@@ -132,6 +136,8 @@ class Scene:
     """file name as given"""
     notes: tuple[str, ...] = ()
     """what the user should know that is not wrong, e.g. keys without effect"""
+    method_reason: str | None = None
+    """why `auto` chose numerics.method; None where the file names it"""
 
     @property
     def name(self) -> str:
@@ -163,7 +169,8 @@ class Scene:
     @property
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 of what is simulated, wherever its file lies."""
-        tables = {k: v for k, v in self.as_dict().items() if k not in ("path", "notes", "title")}
+        beside = ("path", "notes", "title", "method_reason")
+        tables = {k: v for k, v in self.as_dict().items() if k not in beside}
         text = json.dumps(tables, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
