@@ -116,6 +116,8 @@ def rod_error(draft: Draft, contact: bool = True) -> tuple[float, str]:
 def _group_error(group: Values, name: str, flow: Flow, pushes: bool) -> tuple[float, str]:
     if group["node_file"] is not None:
         return math.inf, f"the node file of {name} may hold bent fibers"
+    if group["length_distribution"] is not None:
+        return math.inf, f"fibers of many lengths ({name}) are packed as chains"
     sizes = ("aspect_ratio", "diameter", "length", "bending_modulus", "axial_modulus")
     ratio, diameter, length, bending, axial = (group[key] for key in sizes)
     gradient = flow.velocity_gradient

@@ -20,6 +20,8 @@ from warpfiber.scene.tables import (
     FiberGroup,
     Flow,
     Gravity,
+    Layer,
+    LengthDistribution,
     Load,
     Shape,
     Start,
@@ -194,6 +196,8 @@ _TABLE_CLASSES: dict[str, type] = {
     "flow": Flow,
     "fibers": FiberGroup,
     "shape": Shape,
+    "length_distribution": LengthDistribution,
+    "layers": Layer,
     "contact": Contact,
     "wall": Wall,
     "gravity": Gravity,
@@ -229,7 +233,7 @@ def _table_value(name: str, value: Any, path: str) -> Any:
         return tuple(_table_value(name, row, path) for row in value)
     fields = {
         "from_" if key == "from" else key: (
-            _table_value(key, item, path) if isinstance(item, dict) else _frozen(item)
+            _table_value(key, item, path) if _is_table(item) else _frozen(item)
         )
         for key, item in value.items()
     }
@@ -254,6 +258,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return value
+
+
+def _is_table(value: Any) -> bool:
+    """Tell whether a recorded value is a table or a list of tables."""
+    first = value[0] if isinstance(value, list | tuple) and value else value
+    return isinstance(first, dict)
 
 
 def _frozen(value: Any) -> Any:
