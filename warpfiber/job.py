@@ -27,6 +27,7 @@ from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.simulation import BoxExhausted, Diverged, Simulation, preflight, with_device
 from warpfiber.stopping import Stopper
 from warpfiber.summary import Summary, versions
+from warpfiber.trial import after_trial
 
 LOOK_EVERY = 0.2  # s of wall time between looks at stop requests and the progress line
 PROFILE_STEPS = 5
@@ -74,6 +75,7 @@ class Job:
         faults = _faults_of(preflight, scene) + _faults_of(ResultFolder.check, out, overwrite)
         if faults:
             raise SceneError(faults)
+        scene = after_trial(scene, workers)
         simulation = Simulation(scene, workers=workers)
         folder = ResultFolder.create(out, scene.name, overwrite)
         job = cls(simulation, folder, progress=progress)
@@ -125,8 +127,10 @@ class Job:
         bound = f" ({warning}limit {limit.dt:.4g} s, {limit.term})"
         if not math.isfinite(limit.dt):
             bound = ""
+        numerics, reason = self.scene.numerics, self.scene.method_reason
+        chosen = f"method {numerics.method} by auto ({reason}), " if reason else ""
         return (
-            f"{model.fiber_count} fibers, {model.segment_count} segments, "
+            f"{chosen}{model.fiber_count} fibers, {model.segment_count} segments, "
             f"dt {self.simulation.dt:.4g} s{bound}, "
             f"{self.scene.numerics.precision} on {self.simulation.device}, "
             f"workers {self.simulation.method.workers}"

@@ -51,19 +51,14 @@ segments = 26
 
 
 NOT_YET: list[tuple[dict[str, object], str]] = [
-    ({"numerics.method": "rigid_rod"}, "numerics.method"),
-    ({"numerics.method": "auto"}, "numerics.method"),
     ({"numerics.contact": "unilateral"}, "numerics.contact"),
     ({"flow.kind": "field", "flow.file": "a.npz"}, "flow.kind"),
-    ({"fibers.0.count": GONE, "fibers.0.layers": "layers.csv"}, "fibers.0.layers"),
-    ({"fibers.0.frozen": True}, "fibers.0.frozen"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible"),
     ({"fibers.0.shape": {"kind": "ring"}}, "fibers.0.shape.kind"),
     ({"contact.law": "linear", "contact.stiffness": 1}, "contact.law"),
     ({"contact.friction": 0.3}, "contact.friction"),
     ({"contact.wall_friction": 0.3}, "contact.wall_friction"),
     ({"wall": [{"name": "z+", "velocity": [1, 0, 0]}]}, "wall"),
-    ({"load": [{"force": [1, 0, 0]}]}, "load"),
     ({"stage.0.save": True}, "stage.0.save"),
     ({"stage.0.kind": "settle"}, "stage.0.kind"),
     ({"record.quantities": ["stress"]}, "record.quantities"),
@@ -120,18 +115,41 @@ def test_what_overdamped_cannot_run(changes: dict[str, object], key: str, advice
     assert advice in faults[0].remedy
 
 
+RODS = OVERDAMPED | {"numerics.method": "rigid_rod", "numerics.segments": GONE}
+NOT_RODS: list[tuple[dict[str, object], str, str]] = [
+    ({"contact": GONE}, "contact.law", "the default is not available"),
+    ({"contact.law": "exponential"}, "contact.law", "rods do not meet"),
+    ({"box.boundary": ["periodic", "wall", "wall"]}, "box.boundary", "wall is not available"),
+    ({"numerics.closure": "paper"}, "numerics.closure", 'use closure = "consistent"'),
+    ({"numerics.segments": 3}, "numerics.segments", "a rod is one segment"),
+    ({"numerics.reduced_beads": 4}, "numerics.reduced_beads", "a rod is one segment"),
+    ({"fibers.0.aspect_ratio": 1.5}, "fibers.0.aspect_ratio", "too short for one segment"),
+    ({"gravity": {}}, "fibers.0.density", "missing"),
+    ({"flow": GONE, "stage.0.end_time": 1}, "flow", "missing: rigid_rod moves fibers by drag"),
+]
+
+
+def test_rods_have_one_segment_and_nothing_to_solve() -> None:
+    given = {"numerics.integrator": "bdf2", "fibers.0.inextensible": True}
+    scene = scene_from_dict(changed(RODS | given))
+    assert scene.numerics.segments == scene.fibers[0].segments == 1
+    assert scene.numerics.closure == "consistent"
+    assert scene.numerics.integrator is None and scene.numerics.tolerance is None
+    for key in ("numerics.integrator", "fibers.0.inextensible"):
+        assert any(note.startswith(f"{key} has no effect") for note in scene.notes)
+
+
+@pytest.mark.parametrize(("changes", "key", "advice"), NOT_RODS)
+def test_what_rods_cannot_run(changes: dict[str, object], key: str, advice: str) -> None:
+    faults = faults_of(changed(RODS | changes))
+    assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
+    assert advice in faults[0].remedy
+
+
 def test_start_is_known() -> None:
     """[start] is not available, and does not go with [[fibers]] and [box]."""
     faults = faults_of(changed({"start": {"from": "results/a", "stage": "load"}}))
     assert [fault.key for fault in faults] == ["start", "fibers", "box"]
-
-
-def test_length_distribution_is_known() -> None:
-    """A length distribution is read whole and told to be not available."""
-    weibull = {"kind": "weibull", "number_average": 1e-3, "weight_average": 2e-3}
-    changes: dict[str, object] = {"fibers.0.aspect_ratio": GONE}
-    faults = faults_of(changed(changes | {"fibers.0.length_distribution": weibull}))
-    assert [fault.key for fault in faults] == ["fibers.0.length_distribution"]
 
 
 def test_bonded_spheres_scene_has_only_known_keys() -> None:

@@ -22,7 +22,7 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
 from warpfiber.model import EXPIRED, PAIR_COUNT, TORN, Model, State
-from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
@@ -76,7 +76,7 @@ class BeadChain(Method):
             self.check_box()
         self._allocate_pair_results()
 
-    def launches(self) -> list[Launch | Call]:
+    def launches(self) -> list[Launch | Call | Repeat]:
         """Clock, pairs and nodes."""
         return [*step_launches(self)]
 

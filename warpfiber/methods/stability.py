@@ -26,6 +26,7 @@ import numpy as np
 from warpfiber.laws.closure import galerkin_entries
 from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.derived import INERTIALESS
 
 Bands = np.ndarray  # (3, nodes), symmetric
 CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
@@ -183,7 +184,12 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
 
 @lru_cache(maxsize=4)
 def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
-    """All limits of all groups, smallest first; `overdamped` has none but the strain of a step."""
+    """All limits of all groups, smallest first.
+
+    `overdamped` has none but the strain of a step, `rigid_rod` none at all.
+    """
+    if scene.numerics.method == "rigid_rod":
+        return (StepLimit("none: maps of the flow are exact", math.inf, 0, "accurate"),)
     if scene.numerics.method == "overdamped":
         dt = largest_step(scene)
         return (StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0, "accurate"),)
@@ -194,7 +200,7 @@ def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
 def chosen_step(scene: Scene) -> float:
     """dt in s: given (or from the strain step), or `dt_fraction` of the smallest limit."""
     numerics = scene.numerics
-    if numerics.method == "overdamped":
+    if numerics.method in INERTIALESS:
         return strain_step(scene)
     if numerics.dt is not None:
         return numerics.dt

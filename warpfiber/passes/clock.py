@@ -1,7 +1,7 @@
 """Begin of a step: time, strain, the flow's gradient, the lattice and the list's deformation.
 
 Source: d(lattice)/dt = L lattice for a box whose lattice moves with the flow; exp(L dt) by its
-    series to fourth order (exact for simple shear, where L L = 0).
+    series to fourth order where L dt is small (exact for simple shear, where L L = 0).
 """
 
 from functools import cache
@@ -9,11 +9,15 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import EXPIRED, HALT, TORN, precision
+from warpfiber.passes.exponential import make_exponential
+
+SERIES_SIZE = 0.03  # row sum of L dt up to which the fourth order is enough
 
 
 @cache
 def make_flow_history():
     """`rate_factor(strain, schedule)` and `lattice_push(L dt)` = exp(L dt), in float64."""
+    largest_row_sum, exponential_change = make_exponential()
 
     @wp.func
     def rate_factor(strain: wp.float64, schedule: wp.array(dtype=wp.vec2d)) -> wp.float64:
@@ -30,6 +34,9 @@ def make_flow_history():
     @wp.func
     def lattice_push(x: wp.mat33d) -> wp.mat33d:
         one = wp.identity(n=3, dtype=wp.float64)
+        if largest_row_sum(x) > wp.float64(wp.static(SERIES_SIZE)):
+            change, _unused = exponential_change(x)
+            return one + change
         return one + x * (
             one
             + (x * (one + (x * (one + x * wp.float64(0.25))) * wp.float64(1.0 / 3.0)))

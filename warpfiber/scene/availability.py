@@ -19,18 +19,15 @@ class Row:
     advice: str
 
 
-METHOD_ADVICE = 'use method = "bead_chain", or "overdamped"'
-FIBER_ADVICE = "give several [[fibers]] groups instead"
+METHOD_ADVICE = 'use method = "auto", "bead_chain", "overdamped" or "rigid_rod"'
 STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("fibers", "layers", (), FIBER_ADVICE),
-    Row("fibers", "length_distribution", (), FIBER_ADVICE),
-    Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
-    Row("contact", "law", ("none", "exponential"), 'use law = "exponential" or "none"'),
+    Row("contact", "law", ("none", "exponential", "linear"),
+        'use law = "exponential", "linear" or "none"'),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
     Row("stage", "kind", ("flow",), STAGE_ADVICE),
@@ -44,26 +41,25 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
-    Row("numerics", "method", ("bead_chain", "overdamped"), METHOD_ADVICE),
-    Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
+    Row("numerics", "method", ("bead_chain", "overdamped", "rigid_rod", "auto"), METHOD_ADVICE),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
-    Row("load", "", (), "remove the table; fibers move freely"),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
-
-ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
 
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
+        Row("contact", "law", ("none", "exponential"),
+            'use law = "exponential", or method = "overdamped"'),
+        Row("numerics", "contact", ("penalty",),
+            'use contact = "penalty", or method = "overdamped"'),
     ),
     "overdamped": (
-        Row("contact", "law", ("none",), ALONE_ADVICE),
-        Row("contact", "lubrication", ("none",), ALONE_ADVICE),
-        Row("box", "boundary", ("periodic", "open"),
-            'walls of overdamped do not push; use "periodic" or "open", or method = "bead_chain"'),
+        Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
+    ),
+    "rigid_rod": (
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
 }  # fmt: skip
