@@ -151,6 +151,8 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
     if scene.method_reason is not None:
         rows.append(("chosen by auto", scene.method_reason))
+    if scene.rod_trial is not None:
+        rows.append(("rods instead", "if a trial of the run shows that contact does not bend them"))
     if numerics.method == "rigid_rod":
         rows.append(("dt limit", limits[0].term))
         share = f" = strain {dt * scene.flow.rate:.3g}" if scene.flow and scene.flow.rate else ""

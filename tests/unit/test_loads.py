@@ -7,6 +7,7 @@ well conditioned blocks.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from tests.cell import Kind, bent_fiber, place, straight_fiber
 from tests.reference import loads as restated
 from tests.reference import overdamped as od
 from tests.reference.bead_chain import Array
+from tests.unit.test_responses import Chains, Response, random_rows
 from warpfiber.scene import SceneError, scene_from_dict
 from warpfiber.scene.tables import strain_rate
 from warpfiber.simulation import Simulation
@@ -154,6 +156,46 @@ def test_no_force_is_no_load(start: Start, scheme: str) -> None:
         sim.step(50)
         ends.append(sim.node_pos)
     assert np.abs(ends[0] - ends[1]).max() < 1e-11
+
+
+@pytest.mark.parametrize("form", ["compliant", "inextensible"])
+@pytest.mark.parametrize("name", ["first held", "clamped", "clamped inside", "held inside"])
+def test_contacts_do_not_move_held_nodes(start: Start, name: str, form: str) -> None:
+    """Motion of the others by forces on rows: both solves of a step without the held unknowns."""
+    kind = Kind(6, 2.71)
+    x = bent_fiber(kind, np.random.default_rng(5), stretch=0.002)
+    chains = Chains(functools.partial(start, load=LOADS[name]), [kind], [x], form=form, dense=False)
+    loads = restated_loads(name, len(x))
+    fiber, h = od.Fiber(kind.chain(), GRADIENT, form), restated.CHI * 0.05
+    share = (1.0 - restated.CHI) / restated.CHI
+    first = restated.solve_loaded(fiber, h, x, x, np.zeros(kind.segments), loads)
+    moved = first.node_pos - x
+    problem = od.linearize(
+        fiber, h, x + share * moved, x + moved / restated.CHI, first.tension, loads.force
+    )
+    matrix, _ = od.multiplier_system(problem)
+    tau = od.torque_strength(kind.chain(), np.full(kind.segments, kind.chain().rest_length))
+    across = np.eye(3) - od.outer(problem.axis)
+    resist = od.drag_matrix(kind.chain()) + od.segment_sum(tau[:, None, None] * across)
+    between = loads.held[1:] & loads.held[:-1] & (form == "inextensible")
+    free = ~np.concatenate([np.repeat(loads.held, 3), between])
+
+    def solve(right: Array) -> Array:
+        solution = np.zeros((len(matrix), right.shape[1]))
+        solution[: x.size] = right
+        solution[free] = np.linalg.solve(matrix[np.ix_(free, free)], solution[free])
+        solution[~free] = 0.0
+        return solution
+
+    push = h * np.eye(x.size)
+    whole = solve(push + share * resist @ solve(push)[: x.size])
+    chains.dense = [Response(whole[: x.size], whole[x.size :] / h)]
+    rows = random_rows(kind.segments, 20)
+    got = chains.solve(rows, most=0)
+    shift, _ = chains.respond(chains.jacobian(rows).T @ np.array([row.force for row in rows]))
+    assert np.abs(shift).max() > 1e-3
+    assert np.abs(got.shift - shift).max() < 1e-11 * np.abs(shift).max()
+    assert not got.shift[loads.held].any()
 
 
 def test_held_rods_carry_their_drag(start: Start) -> None:

@@ -192,14 +192,14 @@ def make_dual_lists(name: str):
         fiber_in: wp.array(dtype=wp.int32),
         node_shift: wp.array(dtype=vec3),
     ):
+        fiber = wp.tid() + offset
+        fiber_in[fiber] = -1  # also of a halted step: rows that grew hold no lists yet
         if status[wp.static(HALT)] != 0:
             return
-        fiber = wp.tid() + offset
         first = fiber_node_start[fiber]
         end = fiber_node_start[fiber + 1]
         for i in range(first, end):
             node_shift[i] = vec3()
-        fiber_in[fiber] = -1
         if row_count[0] == 0 or row_count[0] > row_next.shape[0]:
             return
         last = wp.int32(-1)

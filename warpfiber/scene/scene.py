@@ -138,6 +138,8 @@ class Scene:
     """what the user should know that is not wrong, e.g. keys without effect"""
     method_reason: str | None = None
     """why `auto` chose numerics.method; None where the file names it"""
+    rod_trial: RodTrial | None = None
+    """the scene of rods, where a trial of `auto` has to tell whether contact bends them"""
 
     @property
     def name(self) -> str:
@@ -161,6 +163,8 @@ class Scene:
         """Return JSON-ready tables named as in a file, all defaults resolved, no absent keys."""
         tables: dict[str, Any] = {"resolved": True}
         for field in dataclasses.fields(self):
+            if field.name == "rod_trial":  # an open question, no part of what is simulated
+                continue
             value = _plain(getattr(self, field.name))
             if value is not None:
                 tables[_TABLE_NAMES.get(field.name, field.name)] = value
@@ -173,6 +177,15 @@ class Scene:
         tables = {k: v for k, v in self.as_dict().items() if k not in beside}
         text = json.dumps(tables, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class RodTrial:
+    """A scene with `rigid_rod`, and the bending by contact up to which it stands for fibers."""
+
+    scene: Scene
+    tolerance: float
+    """lengths of a fiber"""
 
 
 _TABLE_NAMES = {"walls": "wall", "loads": "load", "stages": "stage"}
