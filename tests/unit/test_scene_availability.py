@@ -155,5 +155,5 @@ def test_start_is_known() -> None:
 def test_bonded_spheres_scene_has_only_known_keys() -> None:
     """A scene of a later version is refused for that reason alone."""
     faults = faults_of(tomllib.loads(BONDED_SPHERES))
-    assert len(faults) == 11
+    assert len(faults) == 10
     assert all("not available in this version" in fault.remedy for fault in faults)

@@ -25,7 +25,6 @@ STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
     Row("contact", "law", ("none", "exponential", "linear"),
         'use law = "exponential", "linear" or "none"'),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
@@ -47,8 +46,13 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 )  # fmt: skip
 
 
+STRAIGHT = Row("shape", "kind", ("straight",),
+               'fibers of this method are straight at rest; use kind = "straight", '
+               "or node_file to start from another form")  # fmt: skip
+
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
+        STRAIGHT,
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
         Row("contact", "law", ("none", "exponential"),
@@ -57,9 +61,11 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
             'use contact = "penalty", or method = "overdamped"'),
     ),
     "overdamped": (
+        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
+        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
 }  # fmt: skip

@@ -66,6 +66,9 @@ def _check_method(draft: Draft) -> None:
         tables: dict[str, Values | None]
         if row.table == "fibers":
             tables = {f"fibers.{index}": group for index, group in enumerate(draft.fibers)}
+        elif row.table == "shape":
+            groups = enumerate(draft.fibers)
+            tables = {f"fibers.{index}.shape": group["shape"] for index, group in groups}
         else:
             tables = {row.table: getattr(draft, row.table)}
         for path, values in tables.items():
