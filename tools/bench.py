@@ -110,6 +110,7 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "fibers.0.aspect_ratio": 51,
                 "fibers.0.count": fibers,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.segments": 10,
                 "numerics.precision": precision,
                 "numerics.dt_fraction": 0.5,
@@ -253,7 +254,11 @@ def period(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for segments in (99, 33, 11, 9, 3, 1) if closure == "paper" else (33, 11, 9, 3, 1):
             scene = wf.load_scene(
                 SCENES / "period.toml",
-                {"numerics.segments": segments, "numerics.closure": closure},
+                {
+                    "numerics.method": "bead_chain",
+                    "numerics.segments": segments,
+                    "numerics.closure": closure,
+                },
             )
             simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
             simulation.step(1)
@@ -299,7 +304,8 @@ def suspensions(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for seed in range(1, args.seeds + 1):
             for segments in args.segments or (CELLS[name], 0):
                 key = "segments" if segments else "reduced_beads"
-                overrides = {"seed": seed, f"numerics.{key}": segments} | dict(args.set)
+                overrides = {"seed": seed, "numerics.method": "bead_chain"}
+                overrides |= {f"numerics.{key}": segments} | dict(args.set)
                 scene = wf.load_scene(SCENES / f"{name}.toml", overrides)
                 yield suspension(scene, args)
 

@@ -245,8 +245,6 @@ def _check_contact(draft: Draft) -> None:
     if draft.contact["law"] == "none" and draft.contact["lubrication"] in ("paper", "shifted"):
         remedy = 'law = "none" switches off all pairs; remove it, or use law = "exponential"'
         draft.blame("contact.lubrication", remedy)
-    if draft.contact["law"] == "linear" and draft.contact["stiffness"] is None:
-        draft.faults.add("contact.stiffness", None, 'missing; law = "linear" needs it in N/m')
     if draft.method not in INERTIALESS:
         return
     if draft.contact["law"] == "none" and draft.axes("wall"):
