@@ -101,7 +101,6 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             fibers = tiles**3 * round(fibers / tiles**3)
             edge = (2.0 * np.pi * 5e-6**3 * 50 * fibers / 0.1) ** (1 / 3)
             overrides = {
-                "numerics.method": "bead_chain",
                 "box.size": [edge] * 3,
                 "box.boundary": ["periodic"] * 3,
                 "fibers.0.aspect_ratio": 51,
@@ -150,6 +149,7 @@ def beads(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "fibers.0.aspect_ratio": 20,
                 "fibers.0.count": 1000,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.reduced_beads": 0,
                 "numerics.precision": precision,
                 "record.quantities": ["overlap"],
