@@ -21,6 +21,7 @@ from functools import lru_cache
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
+from warpfiber.methods.bond_constants import bond_steps
 from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
 
@@ -109,6 +110,8 @@ def _published_closure(n: int, m: float) -> tuple[Matrix, ...]:
 
 def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
+    if scene.numerics.method == "bonded_spheres":
+        return [StepLimit(term, dt, index) for term, dt in bond_steps(scene, group).items()]
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
     mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)

@@ -19,9 +19,9 @@ class Row:
     advice: str
 
 
-METHOD_ADVICE = 'use method = "bead_chain", or "overdamped"'
+METHOD_ADVICE = 'use method = "bead_chain", "overdamped", or "bonded_spheres"'
 FIBER_ADVICE = "give several [[fibers]] groups instead"
-STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
+STAGE_ADVICE = 'only kind = "flow" and "settle" run; end it by end_strain, end_time or end_speed'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
@@ -30,11 +30,10 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("fibers", "length_distribution", (), FIBER_ADVICE),
     Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
-    Row("contact", "law", ("none", "exponential"), 'use law = "exponential" or "none"'),
+    Row("contact", "law", ("none", "exponential"), 'use law = "none", or in a flow "exponential"'),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
-    Row("stage", "kind", ("flow",), STAGE_ADVICE),
-    Row("stage", "end_speed", (), STAGE_ADVICE),
+    Row("stage", "kind", ("flow", "settle"), STAGE_ADVICE),
     Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
     Row("stage", "end_pressure", (), STAGE_ADVICE),
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
@@ -44,27 +43,40 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
-    Row("numerics", "method", ("bead_chain", "overdamped"), METHOD_ADVICE),
+    Row("numerics", "method", ("bead_chain", "overdamped", "bonded_spheres"), METHOD_ADVICE),
     Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
-    Row("load", "", (), "remove the table; fibers move freely"),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
 
+FLOWING = (
+    Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
+    Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
+    Row("load", "force", (), "remove the table; single nodes of this method take no load"),
+    Row("load", "hold", (), "remove the table; nodes of this method move freely"),
+)
 ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
 
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
+        *FLOWING,
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
     ),
     "overdamped": (
+        *FLOWING,
         Row("contact", "law", ("none",), ALONE_ADVICE),
         Row("contact", "lubrication", ("none",), ALONE_ADVICE),
         Row("box", "boundary", ("periodic", "open"),
             'walls of overdamped do not push; use "periodic" or "open", or method = "bead_chain"'),
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
+    ),
+    "bonded_spheres": (
+        Row("stage", "kind", ("settle",), 'there is no fluid; use kind = "settle"'),
+        Row("contact", "law", ("none",), 'fibers do not meet yet; use law = "none"'),
+        Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
+        Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
     ),
 }  # fmt: skip
 """Values that run with one method only, defaults included."""

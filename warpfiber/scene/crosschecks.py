@@ -22,6 +22,7 @@ DRAGGED = ("bead_chain", "overdamped")
 HOPELESS_FRACTION = 0.9
 """Volume fraction that no packing of straight fibers reaches: touching parallel cylinders fill
 pi/(2 sqrt 3) = 0.907."""
+LARGEST_POISSON = 0.5
 WALL_GAP = 1e-3
 """Gap kept to walls by the placement, in radii."""
 
@@ -62,8 +63,9 @@ def _check_method(draft: Draft) -> None:
     """What the method cannot run, defaults included, and what its step and weight need."""
     for row in NOT_IN_METHOD.get(draft.method or "", ()):
         tables: dict[str, Values | None]
-        if row.table == "fibers":
-            tables = {f"fibers.{index}": group for index, group in enumerate(draft.fibers)}
+        many = {"fibers": draft.fibers, "stage": draft.stages, "load": draft.loads}
+        if row.table in many:
+            tables = {f"{row.table}.{i}": table for i, table in enumerate(many[row.table])}
         else:
             tables = {row.table: getattr(draft, row.table)}
         for path, values in tables.items():
@@ -74,6 +76,8 @@ def _check_method(draft: Draft) -> None:
                 draft.faults.add(
                     f"{path}.{row.key}", value, remedy if given else f"the default is {remedy}"
                 )
+    if draft.method == "bonded_spheres":
+        _check_bonded_spheres(draft)
     if draft.method != "overdamped":
         return
     if draft.numerics["tolerance"] is not None:
@@ -89,6 +93,47 @@ def _check_method(draft: Draft) -> None:
             draft.faults.add(
                 f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
             )
+
+
+def _check_bonded_spheres(draft: Draft) -> None:
+    """No fluid; elastic constants that hold together; loads on nodes that there are."""
+    if draft.is_given("flow"):
+        draft.faults.add("flow", None, "bonded_spheres has no fluid; remove the table")
+    if draft.numerics["strain_step"] is not None:
+        draft.blame("numerics.strain_step", "nothing is strained at a rate; give dt in s instead")
+    for index, group in enumerate(draft.fibers):
+        path = f"fibers.{index}"
+        if group["bending_modulus"] == 0.0:
+            draft.blame(f"{path}.bending_modulus", "a bond without bending has no shape; give > 0")
+        if (group["poisson_ratio"] or 0.0) > LARGEST_POISSON:
+            draft.blame(f"{path}.poisson_ratio", "no isotropic solid has more than 0.5")
+    for index, stage in enumerate(draft.stages):
+        if stage["time_limit"] is not None and not draft.is_given(f"stage.{index}.time_limit"):
+            limit = number_text(stage["time_limit"])
+            draft.note(
+                f"stage.{index}: rows and frames are spread over time_limit = {limit} s (default); "
+                "give a nearer one for more of them"
+            )
+    for index, load in enumerate(draft.loads):
+        _check_load(draft, load, f"load.{index}")
+
+
+def _check_load(draft: Draft, load: Values, path: str) -> None:
+    """A load has a group, a fiber and a node; a force where it is free, a velocity where held."""
+    groups = draft.fibers
+    if load["group"] is None or not -len(groups) <= load["group"] < len(groups):
+        draft.blame(f"{path}.group", f"there are {len(groups)} [[fibers]]; count from 0")
+        return
+    group = groups[load["group"]]
+    sizes = {"fiber": group["count"], "node": (group["segments"] or 0) + 1}
+    for key, size in sizes.items():
+        if load[key] is None or not size or group["node_file"] is not None:
+            continue
+        if not -size <= load[key] < size:
+            draft.blame(f"{path}.{key}", f"the group has {size}; count from 0, or back from -1")
+    unused = "velocity" if load["hold"] == "free" else "force"
+    if load[unused] is not None:
+        draft.blame(f"{path}.{unused}", f'has no effect with hold = "{load["hold"]}"; remove it')
 
 
 def _check_flow(draft: Draft) -> None:

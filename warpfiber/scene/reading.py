@@ -31,7 +31,7 @@ from warpfiber.scene.schema import (
     TOP,
     WALL,
 )
-from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Shape
+from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape
 
 T = TypeVar("T")
 TOML_PLACE = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
@@ -233,6 +233,7 @@ def _finished(draft: Draft, path: str) -> Scene:
         ),
         contact=_made(Contact, draft.contact),
         gravity=_made(Gravity, draft.gravity) if draft.gravity is not None else None,
+        loads=tuple(_made(Load, load) for load in draft.loads),
         stages=tuple(_made(Stage, stage) for stage in draft.stages),
         record=_made(Record, draft.record),
         numerics=_made(Numerics, draft.numerics),

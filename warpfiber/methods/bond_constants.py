@@ -1,0 +1,115 @@
+"""Masses, stiffnesses and dashpots of the nodes and bonds of one fiber group, and their steps.
+
+Source: Xu, Ma & Guo 2023, Eqs. (3)-(10). Differences: a node has the mass of the length of fiber
+    around it, not of a sphere; `bond_shear = "rbf"` adds the bending flexibility l^3 / (12 E I)
+    that is left when a straight bond stands for a bent segment, which makes the nodes of a bent
+    fiber exact for any number of them. Dashpots are shares of the critical one of two nodes.
+Symbols: a radius, l length of a segment along the fiber, A = pi a^2, I = pi a^4 / 4, I_p = 2 I,
+    G = E / (2 (1 + nu)), J = 2/5 m a^2; all SI.
+Limits: J is that of a sphere also where l > 2 a, where a true slice has more; high modes differ.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from warpfiber.scene import FiberGroup, Scene
+
+WALL_OVERLAP = 0.1  # radii, where the stiffness of a wall is taken for the step
+CAP_VOLUME = {"centerline": 0.0, "capsule": 2.0 / 3.0, "cylinder": 1.0}
+"""Volume of one end by the box's volume rule, in pi a^3."""
+
+
+@dataclass(frozen=True)
+class BondConstants:
+    """SI; tuples are (stretching, shear, bending, twist)."""
+
+    segment_length: float
+    stiffness: tuple[float, float, float, float]
+    """N/m, N/m, N m, N m"""
+    dashpots: tuple[float, float, float, float]
+    """N s/m, N s/m, N m s, N m s"""
+    mass: float
+    """kg, of an inner node"""
+    end_mass: float
+    inertia: float
+    """kg m^2"""
+    end_inertia: float
+    wall_modulus: float
+    """E* of a rigid wall, Pa"""
+
+
+def is_closed(group: FiberGroup) -> bool:
+    """Whether a bond joins the last node to the first."""
+    return group.shape.kind == "ring" and group.node_file is None
+
+
+def bond_constants(scene: Scene, group: FiberGroup) -> BondConstants:
+    """Constants of one group whose segments are known."""
+    a, nu = group.radius, group.poisson_ratio
+    length = group.centerline_length / group.segments
+    area, second = math.pi * a * a, 0.25 * math.pi * a**4
+    shear_modulus = 0.5 * group.youngs_modulus / (1.0 + nu)
+    bending = group.bending_modulus * second / length
+    flexibility = length / (shear_modulus * area)
+    if scene.numerics.bond_shear != "ga":
+        flexibility += length**2 / (12.0 * bending)
+    stiffness = (
+        group.axial_modulus * area / length,
+        1.0 / flexibility,
+        bending,
+        shear_modulus * 2.0 * second / length,
+    )
+    density = group.density or 0.0
+    mass = density * area * length
+    rule = scene.box.volume_rule if scene.box is not None else "capsule"
+    end_mass = 0.5 * mass + CAP_VOLUME[rule] * math.pi * a**3 * density
+    inertia = 0.4 * mass * a * a
+    moved = (mass, mass, inertia, inertia)
+    modulus = scene.contact.modulus or group.youngs_modulus
+    return BondConstants(
+        segment_length=length,
+        stiffness=stiffness,
+        dashpots=tuple(  # type: ignore[arg-type]
+            group.bond_damping * math.sqrt(2.0 * m * k)
+            for m, k in zip(moved, stiffness, strict=True)
+        ),
+        mass=mass,
+        end_mass=end_mass,
+        inertia=inertia,
+        end_inertia=0.4 * end_mass * a * a,
+        wall_modulus=modulus / (1.0 - nu * nu),
+    )
+
+
+def damped_step(mass: float, damping: float, stiffness: float) -> float:
+    """Largest dt with 4 m - 2 dt c - dt^2 k >= 0: where an oscillator's eigenvalue is -1."""
+    root = math.sqrt(damping * damping + 4.0 * mass * stiffness)
+    return (root - damping) / stiffness
+
+
+def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
+    """Largest stable steps (s) by what sets them.
+
+    Nodes that alternate along a long fiber strain a bond by twice their motion; nodes that all turn
+    alike shear both bonds of a node by half a segment each.
+    """
+    c = bond_constants(scene, group)
+    k, d = c.stiffness, c.dashpots
+    arm = c.segment_length**2
+    steps = {
+        "bond stretching": damped_step(c.mass, 4.0 * d[0], 4.0 * k[0]),
+        "bond shear": damped_step(c.inertia, d[1] * arm, k[1] * arm),
+        "bond bending": damped_step(c.inertia, 4.0 * d[2], 4.0 * k[2]),
+        "bond twist": damped_step(c.inertia, 4.0 * d[3], 4.0 * k[3]),
+    }
+    walls = sum(kind == "wall" for kind in scene.box.boundary) if scene.box is not None else 0
+    if walls:
+        depth = WALL_OVERLAP * group.radius
+        stiffness = 2.0 * c.wall_modulus * math.sqrt(group.radius * depth)
+        resistance = 2.0 * math.sqrt(5.0 / 6.0) * scene.contact.damping
+        steps["walls"] = damped_step(
+            c.end_mass, resistance * math.sqrt(stiffness * c.end_mass), stiffness
+        )
+    return steps
