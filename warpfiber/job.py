@@ -213,7 +213,7 @@ class Job:
         steps_to = self.simulation.steps_to
         end = self.simulation.stage_steps(stage, self.stage_start)
         limit = self.simulation.steps_to_limit(stage, self.stage_start)
-        return [int(min(end, max(1, limit))), steps_to(*row), steps_to(*frame)]
+        return [min(end, max(1, limit)), steps_to(*row), steps_to(*frame)]
 
     def _event_mark(
         self, stage: Stage, index: int, interval: tuple[str, float]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -218,10 +219,10 @@ class Simulation:
             return self.steps_to(*marks)
         return own if marks == (None, None) else min(own, self.steps_to(*marks))
 
-    def steps_to_limit(self, stage: Stage, start: tuple[float, float]) -> float:
-        """Steps that surely do not pass the time limit of such a stage; inf without one."""
+    def steps_to_limit(self, stage: Stage, start: tuple[float, float]) -> int:
+        """Steps that surely do not pass the time limit of such a stage; many without one."""
         if stage.time_limit is None:
-            return math.inf
+            return sys.maxsize
         return self.steps_to(None, start[1] + stage.time_limit)
 
     def unmet(self, stage: Stage) -> str:

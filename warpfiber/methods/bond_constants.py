@@ -1,4 +1,4 @@
-"""Masses, stiffnesses and dashpots of the nodes and bonds of one fiber group, and their steps.
+"""Masses, stiffnesses and dashpots of the nodes and bonds of one fiber group.
 
 Source: Xu, Ma & Guo 2023, Eqs. (3)-(10). Differences: a node has the mass of the length of fiber
     around it, not of a sphere; `bond_shear = "rbf"` adds the bending flexibility l^3 / (12 E I)
@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 from warpfiber.scene import FiberGroup, Scene
 
-WALL_OVERLAP = 0.1  # radii, where the stiffness of a wall is taken for the step
 CAP_VOLUME = {"centerline": 0.0, "capsule": 2.0 / 3.0, "cylinder": 1.0}
 """Volume of one end by the box's volume rule, in pi a^3."""
 
@@ -81,35 +80,3 @@ def bond_constants(scene: Scene, group: FiberGroup) -> BondConstants:
         end_inertia=0.4 * end_mass * a * a,
         wall_modulus=modulus / (1.0 - nu * nu),
     )
-
-
-def damped_step(mass: float, damping: float, stiffness: float) -> float:
-    """Largest dt with 4 m - 2 dt c - dt^2 k >= 0: where an oscillator's eigenvalue is -1."""
-    root = math.sqrt(damping * damping + 4.0 * mass * stiffness)
-    return (root - damping) / stiffness
-
-
-def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
-    """Largest stable steps (s) by what sets them.
-
-    Nodes that alternate along a long fiber strain a bond by twice their motion; nodes that all turn
-    alike shear both bonds of a node by half a segment each.
-    """
-    c = bond_constants(scene, group)
-    k, d = c.stiffness, c.dashpots
-    arm = c.segment_length**2
-    steps = {
-        "bond stretching": damped_step(c.mass, 4.0 * d[0], 4.0 * k[0]),
-        "bond shear": damped_step(c.inertia, d[1] * arm, k[1] * arm),
-        "bond bending": damped_step(c.inertia, 4.0 * d[2], 4.0 * k[2]),
-        "bond twist": damped_step(c.inertia, 4.0 * d[3], 4.0 * k[3]),
-    }
-    walls = sum(kind == "wall" for kind in scene.box.boundary) if scene.box is not None else 0
-    if walls:
-        depth = WALL_OVERLAP * group.radius
-        stiffness = 2.0 * c.wall_modulus * math.sqrt(group.radius * depth)
-        resistance = 2.0 * math.sqrt(5.0 / 6.0) * scene.contact.damping
-        steps["walls"] = damped_step(
-            c.end_mass, resistance * math.sqrt(stiffness * c.end_mass), stiffness
-        )
-    return steps

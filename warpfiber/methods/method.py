@@ -155,8 +155,8 @@ class Method(ABC):
 
     # -- stages -----------------------------------------------------------------------------------
 
-    def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
-        """Take over what a stage changes; `resumed`: it began before the state was saved."""
+    def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:  # noqa: B027
+        """Take over what a stage changes, if anything; `resumed`: it began before a restart."""
 
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which the method's own condition surely does not end it; None without."""

@@ -1,4 +1,4 @@
-"""Largest step of the explicit bead chain, term by term, and the step that a scene takes.
+"""Largest step of the explicit methods, term by term, and the step that a scene takes.
 
 Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
     max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
@@ -21,12 +21,14 @@ from functools import lru_cache
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
-from warpfiber.methods.bond_constants import bond_steps
+from warpfiber.laws.hertz import DASHPOT
+from warpfiber.methods.bond_constants import bond_constants
 from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
 
 Matrix = np.ndarray
-CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
+CONTACT_OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
+LONGEST_CHAIN = 16  # segments; longer fibers of bonded spheres have the same limit
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
 FLOW_STRAIN = 0.02  # largest strain of a step
 
@@ -111,7 +113,7 @@ def _published_closure(n: int, m: float) -> tuple[Matrix, ...]:
 def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
     if scene.numerics.method == "bonded_spheres":
-        return [StepLimit(term, dt, index) for term, dt in bond_steps(scene, group).items()]
+        return _bond_limits(scene, index)
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
     mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)
@@ -154,6 +156,47 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
             StepLimit("lubrication", _bead_limit(0.0, 2.0 * resistance, mass, zeta), index)
         )
     return limits
+
+
+def _bond_limits(scene: Scene, index: int) -> list[StepLimit]:
+    """Motions along, about and across a straight fiber of bonded spheres, and its end at a wall.
+
+    A turn counts as t = l times the angle, so that all entries are masses and stiffnesses. Across,
+    the shear of a bond is w1 - w0 - (t0 + t1) / 2 and its bending (t1 - t0) / l.
+    """
+    group = scene.fibers[index]
+    c = bond_constants(scene, group)
+    n = min(group.segments, LONGEST_CHAIN)
+    arm = c.segment_length**-2
+    after, before = np.eye(n, n + 1, k=1), np.eye(n, n + 1)
+    first, still = after - before, np.zeros((n, n + 1))
+    shear = np.concatenate([first, -0.5 * (after + before)], axis=1)
+    bending = np.concatenate([still, first], axis=1)
+    mass = np.full(n + 1, c.mass)
+    mass[[0, -1]] = c.end_mass
+    turning = np.full(n + 1, c.inertia * arm)
+    turning[[0, -1]] = c.end_inertia * arm
+
+    def limit(inertia: Matrix, *parts: tuple[int, float, Matrix]) -> float:
+        size = len(inertia)
+        stiffness, damping = np.zeros((size, size)), np.zeros((size, size))
+        for mode, factor, strain in parts:
+            stiffness += c.stiffness[mode] * factor * strain.T @ strain
+            damping += c.dashpots[mode] * factor * strain.T @ strain
+        return stable_limit(stiffness, damping, np.diag(inertia), np.zeros((size, size)))
+
+    steps = {
+        "bond stretching": limit(mass, (0, 1.0, first)),
+        "bond shear and bending": limit(
+            np.concatenate([mass, turning]), (1, 1.0, shear), (2, arm, bending)
+        ),
+        "bond twist": limit(turning, (3, arm, first)),
+    }
+    if scene.box is not None and "wall" in scene.box.boundary:
+        stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(CONTACT_OVERLAP)
+        resistance = DASHPOT * scene.contact.damping * math.sqrt(stiffness * c.end_mass)
+        steps["walls"] = _bead_limit(stiffness, resistance, c.end_mass, 0.0)
+    return [StepLimit(term, dt, index) for term, dt in steps.items()]
 
 
 @lru_cache(maxsize=4)

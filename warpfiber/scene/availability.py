@@ -53,8 +53,7 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 FLOWING = (
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
-    Row("load", "force", (), "remove the table; single nodes of this method take no load"),
-    Row("load", "hold", (), "remove the table; nodes of this method move freely"),
+    Row("load", "", (), "remove the table; its loads are of method bonded_spheres"),
 )
 ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
 

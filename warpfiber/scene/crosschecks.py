@@ -63,6 +63,11 @@ def _check_method(draft: Draft) -> None:
     """What the method cannot run, defaults included, and what its step and weight need."""
     for row in NOT_IN_METHOD.get(draft.method or "", ()):
         tables: dict[str, Values | None]
+        if not row.key:
+            remedy = unavailable_in(draft.method, row.table, "", None)
+            if draft.is_given(row.table) and remedy is not None:
+                draft.faults.add(row.table, None, remedy)
+            continue
         many = {"fibers": draft.fibers, "stage": draft.stages, "load": draft.loads}
         if row.table in many:
             tables = {f"{row.table}.{i}": table for i, table in enumerate(many[row.table])}
@@ -71,11 +76,10 @@ def _check_method(draft: Draft) -> None:
         for path, values in tables.items():
             value = values[row.key] if values is not None else None
             remedy = unavailable_in(draft.method, row.table, row.key, value)
-            if value is not None and remedy is not None:
-                given = draft.is_given(f"{path}.{row.key}")
-                draft.faults.add(
-                    f"{path}.{row.key}", value, remedy if given else f"the default is {remedy}"
-                )
+            key = f"{path}.{row.key}"
+            if value is not None and remedy is not None and not draft.faulty(key):
+                given = draft.is_given(key)
+                draft.faults.add(key, value, remedy if given else f"the default is {remedy}")
     if draft.method == "bonded_spheres":
         _check_bonded_spheres(draft)
     if draft.method != "overdamped":
