@@ -35,8 +35,15 @@ class BondConstants:
     inertia: float
     """kg m^2"""
     end_inertia: float
-    wall_modulus: float
-    """E* of a rigid wall, Pa"""
+    compliance: float
+    """(1 - nu^2) / E_c of contacts, 1/Pa"""
+    shear_compliance: float
+    """(2 - nu) / G_c of contacts, 1/Pa"""
+
+    @property
+    def wall_modulus(self) -> float:
+        """E* against a rigid wall, Pa."""
+        return 1.0 / self.compliance
 
 
 def is_closed(group: FiberGroup) -> bool:
@@ -78,5 +85,6 @@ def bond_constants(scene: Scene, group: FiberGroup) -> BondConstants:
         end_mass=end_mass,
         inertia=inertia,
         end_inertia=0.4 * end_mass * a * a,
-        wall_modulus=modulus / (1.0 - nu * nu),
+        compliance=(1.0 - nu * nu) / modulus,
+        shear_compliance=(2.0 - nu) * 2.0 * (1.0 + nu) / modulus,
     )

@@ -1,10 +1,11 @@
 """Fibers as spheres joined by elastic bonds, after Xu, Ma & Guo 2023: translation and rotation.
 
-A step: clock, bonds (kick, drift, loads of bonds, walls, weight and single nodes, kick).
+A step: clock, bonds (kick, drift, loads of bonds, walls, weight and single nodes, kick). Where
+fibers meet, drift (kick, drift), pairs (contact of segments) and bonds (loads, kick).
 Source: bonds in total form with the placed shape as the stress-free one (`laws.bond`), velocity
-    Verlet, plane walls by Hertz. The paper adds up moments step by step; here they follow from the
-    state.
-Limits: no contact between fibers, frictionless walls; dt below `bond_constants.bond_steps`.
+    Verlet, contacts by Hertz, Mindlin and Coulomb. The paper adds up bond moments step by step;
+    here they follow from the state.
+Limits: walls are planes at rest; dt below `stability.step_limits`.
 """
 
 from __future__ import annotations
@@ -17,8 +18,11 @@ import numpy as np
 import warp as wp
 
 from warpfiber.methods.bond_constants import bond_constants, is_closed
+from warpfiber.methods.bonded_contacts import BondedContacts
+from warpfiber.methods.box_limits import bearable_strain
 from warpfiber.methods.method import Method
-from warpfiber.model import Model, State
+from warpfiber.model import EXPIRED, STRETCHED, TORN, Model, State
+from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import (
@@ -31,8 +35,10 @@ from warpfiber.passes.bonds import (
     BondFeatures,
     make_bond_sweep,
 )
+from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import FiberGroup, Scene, Stage
 
@@ -40,7 +46,8 @@ STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
-    "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place"
+    "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place "
+    "wall_memory wall_stiffness"
 ).split()
 _HOLDS = {"free": FREE, "position": HELD, "clamp": CLAMPED}
 
@@ -61,6 +68,8 @@ class BondedSpheres(Method):
             walls=model.domain.wall,
             loads=bool(scene.loads),
             closed=any(is_closed(group) for group in scene.fibers),
+            pairs=scene.contact.law != "none" and model.segment_count > 1,
+            wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
         )
         self.groups = wp.array(
             [self._group(group) for group in scene.fibers],
@@ -79,12 +88,22 @@ class BondedSpheres(Method):
         self.node_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.node_spin_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
+        kept = SIDES * nodes if self.features.wall_friction else 0
+        self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
+        self.wall_stiffness = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
         self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
         # float64 in every precision: world positions in float32 lose slow motion
         self.place = state.node_pos
         if p.name == "float32":
             self.place = wp.zeros(nodes, dtype=wp.vec3d, device=device)
+        self.contacts: BondedContacts | None = None
+        if self.features.pairs:
+            stretch = float(self._segment_stretch().max())
+            self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
+            self.list, self.skin = self.contacts.list, self.contacts.skin
+            self.pair_features = self.contacts.measured
+            self.strain_end = bearable_strain(scene, self.box_width * model.units.length)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -106,7 +125,11 @@ class BondedSpheres(Method):
             buoyant = 1.0 - self.scene.gravity.fluid_density / group.density
             weight = buoyant * np.asarray(self.scene.gravity.acceleration)
         row.weight = p.vec3(*(weight * units.time**2 / units.length))
-        row.wall_modulus = c.wall_modulus * units.length**2 / units.force
+        stress = units.force / units.length**2
+        row.wall_modulus = c.wall_modulus / stress
+        row.compliance = c.compliance * stress
+        row.shear_compliance = c.shear_compliance * stress
+        row.segments = group.segments
         row.torn_length = TEAR_STRETCH * c.segment_length / units.length
         row.closed = int(is_closed(group))
         return row
@@ -140,8 +163,22 @@ class BondedSpheres(Method):
     # -- the step ---------------------------------------------------------------------------------
 
     def launches(self) -> list[Launch | Call]:
-        """Clock and bonds."""
-        return [self._clock(), self._bonds(moves=True)]
+        """Clock and bonds; drift and pairs before the bonds where fibers meet."""
+        if self.contacts is None:
+            return [self._clock(), self._bonds(drifts=True, kicks=True)]
+        return [
+            self._clock(),
+            self._drift(),
+            self._pairs(self.dt),
+            self._bonds(drifts=False, kicks=True),
+        ]
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have, run units; with the start skin."""
+        if self.list is None or self.skin is None:
+            return 0.0
+        return self.list.cell_width - self.list.skin + self.skin.start
 
     def _clock(self) -> Launch:
         state, model = self.state, self.model
@@ -161,14 +198,76 @@ class BondedSpheres(Method):
         ]
         return Launch("clock", make_clock(model.precision.name, False, False), 1, inputs)
 
-    def _bonds(self, moves: bool) -> Launch:
+    def _drift(self) -> Launch:
+        model, state = self.model, self.state
+        assert self.list is not None
+        inputs = [
+            model.precision.real(self.dt),
+            self.list.skin_out,
+            model.fiber_node_start,
+            state.list_pos,
+            self.place,
+            state.node_pos,
+            state.node_velocity,
+            self.node_turn,
+            self.node_spin,
+            self.node_rate,
+            self.node_spin_rate,
+            state.status,
+        ]
+        kernel = make_bond_drift(model.precision.name)
+        return Launch("drift", kernel, model.fiber_count, inputs, split=True)
+
+    def _pairs(self, dt: float) -> Launch:
+        model, state, p = self.model, self.state, self.model.precision
+        contacts, pairs = self.contacts, self.list
+        assert contacts is not None and pairs is not None
+        inputs = [
+            p.real(dt),
+            p.real(self.scene.contact.damping),
+            p.real(self.scene.contact.friction),
+            self.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            model.segment_node,
+            model.segment_fiber,
+            state.lattice_now,
+            pairs.out_start,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.place,
+            state.node_pos,
+            state.node_velocity,
+            self.node_spin,
+            contacts.acts,
+            contacts.force,
+            contacts.moment,
+            contacts.arms,
+            contacts.memory,
+            contacts.stiffness,
+            state.status,
+        ]
+        kernel = make_capsule_pairs(p.name, contacts.features)
+        return Launch("pairs", kernel, model.segment_count, inputs, split=True)
+
+    def _bonds(self, drifts: bool, kicks: bool) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
         low, high = self._walls()
+        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
+        none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
+        gathered: list[Any] = [none_i, none_i, none_i, self.pair_acts, none_3, none_3]
+        gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
+        if self.contacts is not None:
+            pairs, contacts = self.contacts.list, self.contacts
+            gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
+            gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
         inputs = [
             p.real(self.dt),
             low,
             high,
             p.real(self.scene.contact.damping),
+            p.real(self.scene.contact.wall_friction),
+            p.real((self.list.stretch_allowed if self.list else 0.0) / TEAR_STRETCH),
             self.stage,
             self.groups,
             model.fiber_node_start,
@@ -177,6 +276,9 @@ class BondedSpheres(Method):
             self.bond_length,
             self.node_hold,
             self.node_load,
+            *gathered,
+            self.wall_memory,
+            self.wall_stiffness,
             self.place,
             state.node_pos,
             state.node_velocity,
@@ -187,7 +289,7 @@ class BondedSpheres(Method):
             self.still_steps,
             state.status,
         ]
-        kernel = make_bond_sweep(p.name, self.features, moves)
+        kernel = make_bond_sweep(p.name, self.features, drifts, kicks)
         return Launch("bonds", kernel, model.fiber_count, inputs, split=True)
 
     def _walls(self) -> tuple[Any, Any]:
@@ -199,15 +301,41 @@ class BondedSpheres(Method):
         kernels = list(measuring)
         if self.executor is None and "energy" in self.scene.record.quantities:
             kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
+        if self.contacts is not None:
+            kernels += self.contacts.kernels()
         super().prepare(kernels)
         if self.started:
             return
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        begin = Executor([self._bonds(moves=False)], self.model.device)
+        first: list[Launch | Call] = [self._bonds(drifts=False, kicks=False)]
+        if self.contacts is not None:
+            if self.contacts.build(self.step_count):
+                self._stop_executor()
+                super().prepare()  # a list that grew has other arrays
+            first = [self._pairs(0.0), self._bonds(drifts=False, kicks=False)]
+        begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
+
+    def _settle(self) -> bool:
+        """Build the list anew if it has expired; False if a fiber tore."""
+        status = self._status()
+        torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
+        if torn:
+            return False
+        if (expired or stretched) and self.contacts is not None:
+            if self.contacts.expire(self.step_count, stretched):
+                self._stop_executor()
+            self.list_seconds = self.contacts.seconds
+        return True
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        super().close()
+        if self.list is not None:
+            self.list.close()
 
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
         """Take over the damping of a stage; count anew how long all nodes have been still."""
@@ -265,13 +393,17 @@ class BondedSpheres(Method):
 
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
-        return {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"bonds_{name}"])
         self.started = True
+        if self.contacts is not None:
+            self.contacts.restore(arrays, self.step_count)
+            self._stop_executor()
 
     def torn_fiber(self) -> dict[str, Any]:
         """First torn fiber, its worst node, and the pull (N) of its longest bond."""

@@ -26,7 +26,7 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     _, bond_energies, _ = make_bond(name)
-    _, plane_energy = make_hertz(name)
+    _, _, plane_energy = make_hertz(name)
     wall_x, wall_y, wall_z = walls
     has_walls = any(walls)
 

@@ -27,6 +27,9 @@ def bond_group_struct(name: str) -> Any:
         end_inertia: real
         weight: vec3  # acceleration by gravity, less buoyancy
         wall_modulus: real  # E* against a rigid wall
+        compliance: real  # (1 - nu^2) / E_c
+        shear_compliance: real  # (2 - nu) / G_c
+        segments: wp.int32
         torn_length: real  # a longer bond is no physical state
         closed: wp.int32  # 1: a bond joins the last node to the first
 

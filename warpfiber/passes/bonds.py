@@ -1,10 +1,10 @@
-"""One sweep over fibers made of bonded spheres: kick, drift, loads of the bonds and walls, kick.
+"""One sweep over fibers made of bonded spheres: kick, drift, loads of bonds, pairs and walls, kick.
 
 One thread walks along one fiber with the node before in its registers: a node is finished as soon
-as the bond behind it is known, so positions are read and written once. Positions are float64 in
-every precision; bonds work with their differences.
+as the bond behind it is known, so positions are read and written once. Where fibers meet, kick and
+drift are a sweep of their own (`bond_drift`), with the pairs between the two. Positions are float64
+in every precision; bonds work with their differences.
 Source: velocity Verlet; loads that depend on speed take that of the middle of the step.
-Limits: loads from other fibers are not gathered.
 """
 
 from dataclasses import dataclass
@@ -13,10 +13,11 @@ from functools import cache
 import warp as wp
 
 from warpfiber.laws.bond import make_bond
-from warpfiber.laws.hertz import make_hertz
 from warpfiber.laws.rotation import make_rotation
-from warpfiber.model import BAD_FIBER, HALT, TORN, precision
+from warpfiber.model import BAD_FIBER, HALT, STRETCHED, TORN, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
+from warpfiber.passes.capsule_pairs import make_gather
+from warpfiber.passes.node_walls import make_node_walls
 
 FREE, HELD, CLAMPED = 0, 1, 2  # of a node: moves; moves as told; also does not turn
 SETTLING, END_SPEED = 0, 1  # slots of the stage's numbers: damping, squared speed of a still node
@@ -31,46 +32,29 @@ class BondFeatures:
     walls: tuple[bool, bool, bool] = (False, False, False)
     loads: bool = False  # forces on single nodes, and nodes that are held
     closed: bool = False  # some fibers are rings
+    pairs: bool = False
+    wall_friction: bool = False
 
 
 @cache
-def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
-    """Kernel `bond_sweep`: a step, or without `moves` only the accelerations of the start."""
+def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool):
+    """Kernel `bond_sweep`: a step; without `drifts` what is left of it after `bond_drift`.
+
+    Without `kicks` too: only the accelerations of the start.
+    """
     p = precision(name)
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     Node = node_struct(name)
     bond_loads, _, bond_dashpots = make_bond(name)
     turned = make_rotation(name)
-    plane_push, _ = make_hertz(name)
-    wall_x, wall_y, wall_z = features.walls
+    wall_loads = make_node_walls(name, features.walls, features.wall_friction)
+    gather_pairs = make_gather(name)
     has_walls = any(features.walls)
     has_dashpots, has_loads = features.dashpots, features.loads
-    has_rings = features.closed
+    has_rings, has_pairs = features.closed, features.pairs
     is_single = name == "float32"
     zero, half, one = real(0.0), real(0.5), real(1.0)
-
-    @wp.func
-    def push(
-        modulus: real, beta: real, radius: real, mass: real, gap: wp.float64, speed: real
-    ) -> real:
-        return plane_push(modulus, beta, radius, mass, radius - real(gap), speed)
-
-    @wp.func
-    def wall_force(
-        g: BondGroup, beta: real, mass: real, x: wp.vec3d, v: vec3, low: wp.vec3d, high: wp.vec3d
-    ) -> vec3:
-        fx, fy, fz = zero, zero, zero
-        if wp.static(wall_x):
-            fx = push(g.wall_modulus, beta, g.radius, mass, x[0] - low[0], v[0])
-            fx -= push(g.wall_modulus, beta, g.radius, mass, high[0] - x[0], -v[0])
-        if wp.static(wall_y):
-            fy = push(g.wall_modulus, beta, g.radius, mass, x[1] - low[1], v[1])
-            fy -= push(g.wall_modulus, beta, g.radius, mass, high[1] - x[1], -v[1])
-        if wp.static(wall_z):
-            fz = push(g.wall_modulus, beta, g.radius, mass, x[2] - low[2], v[2])
-            fz -= push(g.wall_modulus, beta, g.radius, mass, high[2] - x[2], -v[2])
-        return vec3(fx, fy, fz)
 
     @wp.func
     def arrived(
@@ -89,7 +73,7 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
         node.v = node_velocity[i]
         node.q = node_turn[i]
         node.w = node_spin[i]
-        if wp.static(moves):
+        if wp.static(drifts):
             node.v += (half * dt) * node_rate[i]
             node.w += (half * dt) * node_spin_rate[i]
             node.x += wp.vec3d(dt * node.v)
@@ -117,6 +101,8 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
         wall_low: wp.vec3d,
         wall_high: wp.vec3d,
         wall_damping: real,
+        wall_friction: real,
+        stretch_allowed: real,
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -125,6 +111,15 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
         bond_length: wp.array(dtype=real),
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
+        out_start: wp.array(dtype=wp.int32),
+        in_start: wp.array(dtype=wp.int32),
+        in_pair: wp.array(dtype=wp.int32),
+        pair_acts: wp.array(dtype=wp.uint8),
+        pair_force: wp.array(dtype=vec3),
+        pair_moment: wp.array(dtype=vec3),
+        pair_arms: wp.array(dtype=vec4),
+        wall_memory: wp.array(dtype=vec3),
+        wall_stiffness: wp.array(dtype=real),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -146,6 +141,7 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
         nothing = vec3(zero, zero, zero)
         torn2 = g.torn_length * g.torn_length
         torn = wp.int32(0)
+        longest2 = zero
         fastest2 = zero
 
         # A ring's last bond pulls at the first node now and at the last node in the end.
@@ -192,13 +188,47 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
                 if not (length2 < torn2):
                     torn = 1
 
+                if wp.static(has_pairs):
+                    push, couple, push_after, couple_after = gather_pairs(
+                        i - fiber,
+                        out_start,
+                        in_start,
+                        in_pair,
+                        pair_acts,
+                        pair_force,
+                        pair_moment,
+                        pair_arms,
+                    )
+                    force += push
+                    moment += couple
+                    force_after += push_after
+                    moment_after += couple_after
+                    longest2 = wp.max(longest2, length2)
+
             mass = g.mass
             inertia = g.inertia
             if (i == first or i == last) and g.closed == 0:
                 mass = g.end_mass
                 inertia = g.end_inertia
             if wp.static(has_walls):
-                force += wall_force(g, wall_damping, mass, node.x, node.v, wall_low, wall_high)
+                step = zero
+                if wp.static(kicks):
+                    step = dt
+                push, couple = wall_loads(
+                    g,
+                    wall_damping,
+                    wall_friction,
+                    step,
+                    mass,
+                    i,
+                    node,
+                    wall_low,
+                    wall_high,
+                    wall_memory,
+                    wall_stiffness,
+                )
+                force += push
+                moment += couple
             hold = wp.int32(0)
             if wp.static(has_loads):
                 hold = node_hold[i]
@@ -208,7 +238,7 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
             spin_rate = (one / inertia) * moment - settling * node.w
             v = node.v
             w = node.w
-            if wp.static(moves):
+            if wp.static(kicks):
                 v += kick * rate
                 w += kick * spin_rate
             if wp.static(has_loads):
@@ -222,7 +252,7 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
             node_spin_rate[i] = spin_rate
             node_velocity[i] = v
             node_spin[i] = w
-            if wp.static(moves):
+            if wp.static(drifts):
                 place[i] = node.x
                 node_turn[i] = node.q
                 if wp.static(is_single):
@@ -232,11 +262,15 @@ def make_bond_sweep(name: str, features: BondFeatures, moves: bool):
             force = force_after
             moment = moment_after
 
-        if wp.static(moves):
+        if wp.static(kicks):
             count = wp.int32(0)
             if fastest2 < stage[wp.static(END_SPEED)]:
                 count = still_steps[fiber] + 1
             still_steps[fiber] = count
+        if wp.static(has_pairs):
+            allowed = stretch_allowed * g.torn_length
+            if longest2 > allowed * allowed:
+                status[wp.static(STRETCHED)] = 1
         if torn == 1:
             status[wp.static(TORN)] = 1
             status[wp.static(BAD_FIBER)] = fiber

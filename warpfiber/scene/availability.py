@@ -30,9 +30,7 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("fibers", "length_distribution", (), FIBER_ADVICE),
     Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
-    Row("contact", "law", ("none", "exponential"), 'use law = "none", or in a flow "exponential"'),
-    Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
-    Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+    Row("contact", "law", ("none", "exponential", "hertz"), 'use "exponential", "hertz" or "none"'),
     Row("stage", "kind", ("flow", "settle"), STAGE_ADVICE),
     Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
     Row("stage", "end_pressure", (), STAGE_ADVICE),
@@ -53,6 +51,9 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 FLOWING = (
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
+    Row("contact", "law", ("none", "exponential"), 'use "exponential"; "hertz" is of bonded_spheres'),
+    Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
+    Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
     Row("load", "", (), "remove the table; its loads are of method bonded_spheres"),
 )
 ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
@@ -73,7 +74,7 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     ),
     "bonded_spheres": (
         Row("stage", "kind", ("settle",), 'there is no fluid; use kind = "settle"'),
-        Row("contact", "law", ("none",), 'fibers do not meet yet; use law = "none"'),
+        Row("contact", "law", ("none", "hertz"), 'use law = "hertz", or "none"'),
         Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
         Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
     ),
