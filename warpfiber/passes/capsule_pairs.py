@@ -108,11 +108,68 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             return line
         depth = wp.max(reach - wp.length(c), zero)
         factor = hertz_factor(curvatures(ends, ki, kj, sine))
+        patch = wp.sqrt(two * reach * depth) / sine
+        factor *= share_of_contact(
+            gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, patch, node_pos
+        )
         stiffness = two * modulus * factor * wp.sqrt(depth)
         force = two_thirds * stiffness * depth
         if line[0] >= force:
             return line
         return vec4(force, stiffness, st[0], st[1])
+
+    @wp.func
+    def is_hollow(vertex: vec3, from_other: vec3, other: vec3, onward: vec3) -> wp.bool:
+        """Whether a fiber comes nearer again to another segment beyond one of its nodes.
+
+        vertex: the node, and from_other the other segment's start, in one frame; onward: the edge
+        beyond.
+        """
+        part = wp.dot(vertex - from_other, other) / wp.dot(other, other)
+        away = from_other + wp.clamp(part, zero, one) * other - vertex
+        return wp.dot(away, onward) > near * wp.dot(onward, onward)
+
+    @wp.func
+    def share_of_contact(
+        gi: BondGroup,
+        gj: BondGroup,
+        at_i: wp.int32,
+        at_j: wp.int32,
+        node_i: wp.int32,
+        node_j: wp.int32,
+        delta: vec3,
+        a: vec3,
+        b: vec3,
+        st: vec2,
+        patch: real,
+        node_pos: wp.array(dtype=vec3),
+    ) -> real:
+        """Part of Hertz's force that one of several minima within a patch takes.
+
+        In the hollow of a kink both neighbors have one: halves while they coincide, wholes when
+        they are half a patch from the node.
+        """
+        la = wp.length(a)
+        lb = wp.length(b)
+        nothing = vec3(zero, zero, zero)
+        share = one
+        far = st[0] * la
+        if at_i > 0 and far < patch:
+            if is_hollow(nothing, delta, b, node_pos[node_i - 1] - node_pos[node_i]):
+                share *= half + half * far / patch
+        far = (one - st[0]) * la
+        if at_i < gi.segments - 1 and far < patch:
+            if is_hollow(a, delta, b, node_pos[node_i + 2] - node_pos[node_i + 1]):
+                share *= half + half * far / patch
+        far = st[1] * lb
+        if at_j > 0 and far < patch:
+            if is_hollow(delta, nothing, a, node_pos[node_j - 1] - node_pos[node_j]):
+                share *= half + half * far / patch
+        far = (one - st[1]) * lb
+        if at_j < gj.segments - 1 and far < patch:
+            if is_hollow(delta + b, nothing, a, node_pos[node_j + 2] - node_pos[node_j + 1]):
+                share *= half + half * far / patch
+        return share
 
     @wp.func
     def node_between(
