@@ -28,6 +28,14 @@ from typing import Any
 
 import warp as wp
 
+from warpfiber.passes.bond_drift import make_bond_drift
+from warpfiber.passes.bond_energy import make_measure_bonds
+from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
+from warpfiber.passes.capsule_pairs import (
+    CapsuleFeatures,
+    make_capsule_pairs,
+    make_carry_memory,
+)
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_solve import make_chain_step
 from warpfiber.passes.clock import make_clock
@@ -162,6 +170,22 @@ def _pair_variants() -> list[tuple[str, PairFeatures]]:
     ]
 
 
+def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
+    """(variant, features, (drifts, kicks)) of the sweep over bonded spheres."""
+    floor = (False, False, True)
+    bed = BondFeatures(dashpots=True, walls=floor, pairs=True, wall_friction=True)
+    return [
+        ("alone", BondFeatures(), (True, True)),
+        (
+            "held rings",
+            BondFeatures(dashpots=True, walls=floor, loads=True, closed=True),
+            (True, True),
+        ),
+        ("bed", bed, (False, True)),
+        ("start of a bed", bed, (False, False)),
+    ]
+
+
 def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     """(kernel, variant, Warp kernel) of everything that representative scenes launch."""
     for sheared, scheduled in ((False, False), (True, False), (True, True)):
@@ -169,6 +193,14 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         yield "clock_step", variant, make_clock(precision, sheared, scheduled)
     yield "step_begin", "", make_step_begin(precision)
     yield "chain_step", "", make_chain_step(precision)
+    for variant, bonds, parts in _bond_variants():
+        yield "bond_sweep", variant, make_bond_sweep(precision, bonds, *parts)
+    yield "bond_drift", "", make_bond_drift(precision)
+    yield "capsule_pairs", "plain", make_capsule_pairs(precision, CapsuleFeatures())
+    rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
+    yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
+    yield "carry_memory", "", make_carry_memory(precision)
+    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     for variant, adaptive in (("plain", False), ("tolerance", True)):

@@ -2,8 +2,8 @@
 
 Source: elliptic Hertz contacts from the sum of two curvature tensors; along a line where fibers are
     within 30 degrees of each other and the patch is longer than half a segment; the vertex rule;
-    shares of minima in the hollow of a kink, Mindlin and Coulomb. Written with eigenvalues and numerical integrals, where the kernels have
-    closed forms.
+    shares of minima in the hollow of a kink; Mindlin and Coulomb. Written with eigenvalues and
+    numerical integrals, where the kernels have closed forms.
 Symbols: x, v, w nodes of both fibers; s, t parts of the two segments; n from the first to the
     second; a memory is (displacement, stiffness a step ago).
 """

@@ -59,6 +59,7 @@ NOT_YET: list[tuple[dict[str, object], str]] = [
     ({"fibers.0.frozen": True}, "fibers.0.frozen"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible"),
     ({"fibers.0.shape": {"kind": "ring"}}, "fibers.0.shape.kind"),
+    ({"contact.law": "hertz", "contact.lubrication": GONE}, "contact.law"),
     ({"contact.law": "linear", "contact.stiffness": 1}, "contact.law"),
     ({"contact.friction": 0.3}, "contact.friction"),
     ({"contact.wall_friction": 0.3}, "contact.wall_friction"),
@@ -134,8 +135,7 @@ SPHERES: dict[str, object] = {
 
 NOT_SPHERES: list[tuple[dict[str, object], str, str]] = [
     ({"flow": {"kind": "rest", "viscosity": 1.0}}, "flow", "no fluid; remove the table"),
-    ({"contact": GONE}, "contact.law", "the default is not available"),
-    ({"contact.friction": 0.3}, "contact.friction", "frictionless"),
+    ({"contact.law": "exponential"}, "contact.law", '"hertz"'),
     ({"stage.0.kind": "flow"}, "stage.0.kind", 'use kind = "settle"'),
     ({"stage": [{"kind": "settle", "end_strain": 1}]}, "stage.0.end_strain", "end_time"),
     ({"stage.0.kind": "pour"}, "stage.0.kind", "not available"),
@@ -192,5 +192,5 @@ def test_length_distribution_is_known() -> None:
 def test_bonded_spheres_scene_has_only_known_keys() -> None:
     """A scene of a later version is refused for that reason alone."""
     faults = faults_of(tomllib.loads(BONDED_SPHERES))
-    assert len(faults) == 9
+    assert len(faults) == 6
     assert all("not available in this version" in fault.remedy for fault in faults)

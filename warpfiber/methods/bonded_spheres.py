@@ -19,10 +19,16 @@ import warp as wp
 
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
+from warpfiber.methods.bonded_launches import (
+    bond_launch,
+    clock_launch,
+    drift_launch,
+    pair_launch,
+    wall_places,
+)
 from warpfiber.methods.box_limits import bearable_strain
 from warpfiber.methods.method import Method
 from warpfiber.model import EXPIRED, STRETCHED, TORN, Model, State
-from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import (
@@ -33,10 +39,7 @@ from warpfiber.passes.bonds import (
     SETTLING,
     STAGE_SIZE,
     BondFeatures,
-    make_bond_sweep,
 )
-from warpfiber.passes.capsule_pairs import make_capsule_pairs
-from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Call, Executor, Launch
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -165,12 +168,12 @@ class BondedSpheres(Method):
     def launches(self) -> list[Launch | Call]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
         if self.contacts is None:
-            return [self._clock(), self._bonds(drifts=True, kicks=True)]
+            return [clock_launch(self), bond_launch(self, drifts=True, kicks=True)]
         return [
-            self._clock(),
-            self._drift(),
-            self._pairs(self.dt),
-            self._bonds(drifts=False, kicks=True),
+            clock_launch(self),
+            drift_launch(self),
+            pair_launch(self, self.dt),
+            bond_launch(self, drifts=False, kicks=True),
         ]
 
     @property
@@ -179,122 +182,6 @@ class BondedSpheres(Method):
         if self.list is None or self.skin is None:
             return 0.0
         return self.list.cell_width - self.list.skin + self.skin.start
-
-    def _clock(self) -> Launch:
-        state, model = self.state, self.model
-        inputs = [
-            wp.float64(self.dt),
-            wp.float64(0.0),
-            wp.mat33d(),
-            wp.array(self.schedule, dtype=wp.vec2d, device=model.device),
-            state.status,
-            state.step,
-            state.time,
-            state.strain,
-            state.gradient,
-            state.lattice,
-            state.lattice_now,
-            state.deformation,
-        ]
-        return Launch("clock", make_clock(model.precision.name, False, False), 1, inputs)
-
-    def _drift(self) -> Launch:
-        model, state = self.model, self.state
-        assert self.list is not None
-        inputs = [
-            model.precision.real(self.dt),
-            self.list.skin_out,
-            model.fiber_node_start,
-            state.list_pos,
-            self.place,
-            state.node_pos,
-            state.node_velocity,
-            self.node_turn,
-            self.node_spin,
-            self.node_rate,
-            self.node_spin_rate,
-            state.status,
-        ]
-        kernel = make_bond_drift(model.precision.name)
-        return Launch("drift", kernel, model.fiber_count, inputs, split=True)
-
-    def _pairs(self, dt: float) -> Launch:
-        model, state, p = self.model, self.state, self.model.precision
-        contacts, pairs = self.contacts, self.list
-        assert contacts is not None and pairs is not None
-        inputs = [
-            p.real(dt),
-            p.real(self.scene.contact.damping),
-            p.real(self.scene.contact.friction),
-            self.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            model.segment_node,
-            model.segment_fiber,
-            state.lattice_now,
-            pairs.out_start,
-            pairs.pair_j,
-            pairs.pair_image,
-            self.place,
-            state.node_pos,
-            state.node_velocity,
-            self.node_spin,
-            contacts.acts,
-            contacts.force,
-            contacts.moment,
-            contacts.arms,
-            contacts.memory,
-            contacts.stiffness,
-            state.status,
-        ]
-        kernel = make_capsule_pairs(p.name, contacts.features)
-        return Launch("pairs", kernel, model.segment_count, inputs, split=True)
-
-    def _bonds(self, drifts: bool, kicks: bool) -> Launch:
-        model, state, p = self.model, self.state, self.model.precision
-        low, high = self._walls()
-        none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
-        none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
-        gathered: list[Any] = [none_i, none_i, none_i, self.pair_acts, none_3, none_3]
-        gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
-        if self.contacts is not None:
-            pairs, contacts = self.contacts.list, self.contacts
-            gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
-            gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
-        inputs = [
-            p.real(self.dt),
-            low,
-            high,
-            p.real(self.scene.contact.damping),
-            p.real(self.scene.contact.wall_friction),
-            p.real((self.list.stretch_allowed if self.list else 0.0) / TEAR_STRETCH),
-            self.stage,
-            self.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            self.bond_axis,
-            self.bond_length,
-            self.node_hold,
-            self.node_load,
-            *gathered,
-            self.wall_memory,
-            self.wall_stiffness,
-            self.place,
-            state.node_pos,
-            state.node_velocity,
-            self.node_turn,
-            self.node_spin,
-            self.node_rate,
-            self.node_spin_rate,
-            self.still_steps,
-            state.status,
-        ]
-        kernel = make_bond_sweep(p.name, self.features, drifts, kicks)
-        return Launch("bonds", kernel, model.fiber_count, inputs, split=True)
-
-    def _walls(self) -> tuple[Any, Any]:
-        low = np.asarray(self.model.domain.low)
-        return wp.vec3d(*low), wp.vec3d(*(low + np.asarray(self.model.domain.size)))
 
     def prepare(self, measuring: Iterable[Any] = ()) -> None:
         """Compile and capture; find the accelerations of the start."""
@@ -309,12 +196,12 @@ class BondedSpheres(Method):
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        first: list[Launch | Call] = [self._bonds(drifts=False, kicks=False)]
+        first: list[Launch | Call] = [bond_launch(self, drifts=False, kicks=False)]
         if self.contacts is not None:
             if self.contacts.build(self.step_count):
                 self._stop_executor()
                 super().prepare()  # a list that grew has other arrays
-            first = [self._pairs(0.0), self._bonds(drifts=False, kicks=False)]
+            first = [pair_launch(self, 0.0), bond_launch(self, drifts=False, kicks=False)]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
@@ -369,7 +256,7 @@ class BondedSpheres(Method):
             return {}
         model, walls = self.model, self.features.walls
         inputs = [
-            *self._walls(),
+            *wall_places(self),
             self.groups,
             model.fiber_node_start,
             model.fiber_group,

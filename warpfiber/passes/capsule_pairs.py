@@ -18,7 +18,7 @@ from warpfiber.laws.capsule_contact import make_capsule_contact as make_contact
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
-from warpfiber.passes.bond_groups import bond_group_struct, node_struct
+from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
 
 
@@ -37,7 +37,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     p = precision(name)
     real, vec2, vec3, vec4, mat33 = p.real, p.vec2, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
-    Node = node_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, is_local_minimum, _ = make_pair_geometry(name, geometry)
     curvatures, hertz_factor, side_by_side, line_overlap = make_contact(name)
@@ -245,9 +244,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             push = vec4(zero, zero, zero, zero)
             if wp.length_sq(c) < reach * reach:
                 at_j = node_j - fiber_node_start[fiber_j]
-                push = normal_contact(
-                    gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
-                )
+                push = normal_contact(gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos)
             if push[0] <= zero:
                 if pair_acts[k] != wp.uint8(0):
                     pair_acts[k] = wp.uint8(0)
@@ -281,9 +278,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     stiffness = ratio * push[1]
                     slide = slip - approach * n
                     turn = half * dt * wp.dot(w_i + w_j, n)
-                    memory = carried_memory(
-                        pair_memory[k], pair_stiffness[k], stiffness, n, turn
-                    )
+                    memory = carried_memory(pair_memory[k], pair_stiffness[k], stiffness, n, turn)
                     resistance = dashpot * beta * wp.sqrt(stiffness * mass)
                     force, memory = friction_force(
                         memory + dt * slide, stiffness, resistance, slide, friction * size

@@ -51,7 +51,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 FLOWING = (
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
-    Row("contact", "law", ("none", "exponential"), 'use "exponential"; "hertz" is of bonded_spheres'),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
     Row("load", "", (), "remove the table; its loads are of method bonded_spheres"),
@@ -61,6 +60,8 @@ ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         *FLOWING,
+        Row("contact", "law", ("none", "exponential"),
+            'use "exponential"; "hertz" is of method bonded_spheres'),
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
     ),
