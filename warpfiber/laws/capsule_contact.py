@@ -3,11 +3,11 @@
 Source: Hertz for elliptic contacts with the correction F_2 = 1 - (rho^0.0684 - 1)^1.531 (Johnson,
     Contact Mechanics); R* = 1 / sqrt(P) and rho = (S + D) / (S - D), D = sqrt(S^2 - 4 P), with S
     and P the sum and the product of the two principal relative curvatures: hemispheres, hemisphere
-    on cylinder, cylinders at the angle alpha. A contact is longer than a segment where fibers are nearly
-    parallel. There every pair of segments takes its part: F = c pi/4 E* times the integral of the
-    overlap over the length that the two have side by side, at the center of that overlap. c makes
-    the sum over a whole patch that of Hertz, so it does not matter where the nodes are. Overlap
-    along the line: (b^2 - |D(u)|^2) / (b + d_0), exact where it is deepest.
+    on cylinder, cylinders at the angle alpha. Where fibers are nearly parallel a contact is longer
+    than a segment: there every pair of segments takes its part, F = c pi/4 E* times the integral of
+    the overlap over the length that the two have side by side, at the center of that overlap. c
+    makes the sum over a whole patch that of Hertz, so it does not matter where the nodes are.
+    Overlap along the line: (b^2 - |D(u)|^2) / (b + d_0), exact where it is deepest.
 Symbols: b = r_a + r_b, E* = 1 / (e_a + e_b), e = (1 - nu^2) / E_c, delta overlap, D(u) from one
     axis to the other at the part u of a, d_0 their smallest distance as endless lines.
 Limits: sin(alpha) is taken as 0.02 at least, where c = 1.17 instead of 1 of parallel cylinders.
