@@ -59,6 +59,8 @@ ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
 # Kernels that may have a stack frame: name of the kernel, largest frame in bytes, and why.
 FRAMES: dict[str, tuple[int, str]] = {
+    "bond_sweep": (40, "sine and cosine, of nodes that turn by more than 0.2 in a step"),
+    "bond_drift": (40, "as bond_sweep"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
 }
 
