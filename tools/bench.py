@@ -216,6 +216,7 @@ def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             scene = wf.load_scene(
                 SCENES / "flexible.toml",
                 {
+                    "numerics.method": "bead_chain",
                     "numerics.segments": segments,
                     "numerics.closure": closure,
                     "numerics.dt_fraction": fraction,

@@ -1,7 +1,8 @@
 """Benchmark rows of fibers without inertia: wall time, ns per node and solve, error against dt.
 
-`accuracy` of bench.py adds them to its own: the flexible fiber of Fig. 5 without inertia, and a
-cell of such fibers that shows the cost where the launches no longer count.
+`accuracy` of bench.py adds them to its own: the flexible fiber of Fig. 5 without inertia, a cell of
+such fibers that shows the cost where the launches no longer count, and the run time of bead_chain
+over that of overdamped at the same error.
 """
 
 from __future__ import annotations
@@ -32,6 +33,14 @@ SOLVES = {"sdirk2": 2, "bdf2": 1}
 CELL_FIBERS = 1000
 WARM_STEPS = 20  # not timed: within them everything is captured
 
+# z/L of the last node with the bending energy k_b theta^2/2 of bead_chain and no inertia.
+ANGLE_TIP = {20: -0.0158837, 30: -0.0392774, 35: -0.12649, 40: -0.14193, 45: -0.12488}
+# Young's modulus (Pa): density (kg/m3) with which inertia errs by 1e-3 of the length, and the
+# strains at which the last node is looked at. Steps of bead_chain: 0.9 of its stable limit; smaller
+# ones err the same.
+EQUAL_ERROR = {5e8: (9e8, tuple(ANGLE_TIP)), 7e10: (1.4e9, (60, 90, 105, 110, 112, 115, 120))}
+REFERENCE_STEP = 0.005
+
 Common = Callable[[wf.Simulation], dict[str, Any]]
 
 
@@ -49,6 +58,8 @@ def overdamped_rows(
         for integrator in SOLVES:
             keys = {"numerics.integrator": integrator, "numerics.precision": precision}
             yield _cell(scene_file, keys, args, common)
+    for modulus in EQUAL_ERROR:
+        yield _ratio(scene_file, modulus, args, common)
 
 
 def _scene(scene_file: Path, keys: dict[str, Any]) -> wf.Scene:
@@ -118,3 +129,66 @@ def _cell(
     }
     simulation.close()
     return row
+
+
+def _tips(simulation: wf.Simulation, strains: tuple[int, ...]) -> tuple[dict[int, float], float]:
+    """z/L of the last node at the strains; seconds of all steps, the warm ones as the others."""
+    flow, length = simulation.scene.flow, simulation.scene.fibers[0].centerline_length
+    tips, seconds = {}, 0.0
+    simulation.step(WARM_STEPS)
+    for strain in strains:
+        begin = time.perf_counter()
+        simulation.run(until=float(strain))
+        seconds += time.perf_counter() - begin
+        late = (simulation.strain - strain) / flow.rate
+        nodes = simulation.node_pos - late * simulation.node_velocity
+        tips[strain] = float((nodes[-1] - nodes.mean(axis=0))[2] / length)
+    steps = simulation.step_count
+    return tips, seconds * steps / (steps - WARM_STEPS)
+
+
+def _ratio(
+    scene_file: Path, modulus: float, args: argparse.Namespace, common: Common
+) -> dict[str, Any]:
+    """Seconds of bead_chain over those of both integrators, run in turns (medians).
+
+    Errors are against steps of REFERENCE_STEP; for bead_chain, whose bending law differs where
+    joints bend far, against its own law.
+    """
+    density, strains = EQUAL_ERROR[modulus]
+    fiber = {"fibers.0.youngs_modulus": modulus}
+    explicit = {"numerics.method": "bead_chain", "numerics.dt_fraction": 0.9}
+    cases = {"bead_chain": fiber | explicit | {"fibers.0.density": density}}
+    implicit = fiber | {"numerics.method": "overdamped"}
+    for name in SOLVES:
+        cases[name] = implicit | {"numerics.integrator": name, "numerics.strain_step": STEPS[0]}
+
+    def run(keys: dict[str, Any]) -> tuple[dict[int, float], float]:
+        scene = wf.load_scene(scene_file, keys)
+        simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+        found = _tips(simulation, strains)
+        rows.append(common(simulation))
+        simulation.close()
+        return found
+
+    rows: list[dict[str, Any]] = []
+    exact, _ = run(implicit | {"numerics.strain_step": REFERENCE_STEP})
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    errors = {}
+    for _ in range(args.repeats):
+        for name, keys in cases.items():
+            tips, seconds = run(keys)
+            own = ANGLE_TIP if name == "bead_chain" and modulus == 5e8 else exact
+            times[name].append(seconds)
+            errors[name] = max(abs(tips[strain] - own[strain]) for strain in strains)
+    median = {name: float(np.median(values)) for name, values in times.items()}
+    return rows[-1] | {
+        "bench": "accuracy ratio",
+        "youngs_modulus": modulus,
+        "strain": strains[-1],
+        "seconds": {name: round(value, 5) for name, value in median.items()},
+        "seconds_least": {name: round(min(values), 5) for name, values in times.items()},
+        "ratio": {name: round(median["bead_chain"] / median[name], 1) for name in SOLVES},
+        "error": errors,
+        "error_kind": "tip z/L against the same bending law without inertia",
+    }

@@ -28,6 +28,7 @@ from typing import Any
 
 import warp as wp
 
+from warpfiber.laws.contact_compliance import LAWS
 from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import make_measure_bonds
 from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
@@ -37,8 +38,15 @@ from warpfiber.passes.capsule_pairs import (
     make_carry_memory,
 )
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
-from warpfiber.passes.chain_solve import make_chain_step
+from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
+from warpfiber.passes.chain_response import make_chain_apply, make_chain_response
+from warpfiber.passes.chain_solve import CHI, make_chain_step
+from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
+from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
+from warpfiber.passes.held_nodes import make_carry_fibers
+from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.measure import (
     MeasureFeatures,
     make_measure_fibers,
@@ -47,6 +55,10 @@ from warpfiber.passes.measure import (
 )
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
+from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
+from warpfiber.passes.row_count import RowFeatures, make_row_count
+from warpfiber.passes.row_fill import make_row_fill
 from warpfiber.passes.rows import make_row_kernels
 from warpfiber.passes.step_control import (
     make_largest_error,
@@ -188,6 +200,23 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
     ]
 
 
+def _dual_kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
+    for law in LAWS:
+        yield "dual_begin", law, make_dual_begin(precision, law, False)
+        for by_ends, variant in ((False, "rods"), (True, "chains")):
+            yield "dual_balance", f"{law} {variant}", make_dual_balance(precision, law, by_ends)
+    yield "dual_lists", "", make_dual_lists(precision)
+    yield "dual_step", "", make_dual_step(precision)
+    yield "fold_sums", "", make_fold_sums()
+    yield "rod_response", "", make_rod_response(precision, False)
+    yield "rod_apply", "", make_rod_apply(precision)
+    for name, kernel in make_end_kernels(precision).items():
+        yield name, "", kernel
+    yield "chain_moves", "", make_chain_moves(precision, False)
+    yield "chain_response", "", make_chain_response(precision, False)
+    yield "chain_apply", "", make_chain_apply(precision)
+
+
 def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     """(kernel, variant, Warp kernel) of everything that representative scenes launch."""
     for sheared, scheduled in ((False, False), (True, False), (True, True)):
@@ -195,6 +224,10 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         yield "clock_step", variant, make_clock(precision, sheared, scheduled)
     yield "step_begin", "", make_step_begin(precision)
     yield "chain_step", "", make_chain_step(precision)
+    yield "chain_step", "loads", make_chain_step(precision, True, True)
+    yield "carry_fibers", "", make_carry_fibers(precision, True, CHI)
+    yield "rod_maps", "", make_rod_maps(precision)
+    yield "rod_step", "", make_rod_step(precision)
     for variant, bonds, parts in _bond_variants():
         yield "bond_sweep", variant, make_bond_sweep(precision, bonds, *parts)
     yield "bond_drift", "", make_bond_drift(precision)
@@ -205,6 +238,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
+    yield from _dual_kernels(precision)
     for variant, adaptive in (("plain", False), ("tolerance", True)):
         yield "step_end", variant, make_step_end(precision, True, adaptive)
     for variant, nodes in _node_variants():
@@ -218,10 +252,21 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         "deformed": ListFeatures((True, True, True), None, True),
         "pieces": ListFeatures((True, True, True), (0, 2), True, True),
     }
-    for variant, features in lists.items():
+    for variant, list_features in lists.items():
         for make in (make_cell_kernels, make_row_kernels):
-            for name, kernel in make(precision, features).items():
+            for name, kernel in make(precision, list_features).items():
                 yield name, variant, kernel
+    for variant, walls, lubrication in (
+        ("sheared", (False, False, False), "none"),
+        ("wall paper", (False, False, True), "paper"),
+    ):
+        features = RowFeatures(True, walls, lubrication)
+        checks = make_check_sweeps(precision, CheckFeatures(True, walls))
+        for name, kernel in (make_row_count(precision, features) | checks).items():
+            yield name, variant, kernel
+        yield "fill_rows", variant, make_row_fill(precision, features)
+    for name, kernel in make_list_bound(precision).items():
+        yield name, "", kernel
     for variant, fibers in {
         "orientation": MeasureFeatures(),
         "everything": MeasureFeatures(orientation4=True, energy=True, curvature=True),

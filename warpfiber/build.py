@@ -25,8 +25,9 @@ from warpfiber.model import (
     precision,
 )
 from warpfiber.passes.precision import group_struct
-from warpfiber.placement import Placement, place_fibers
+from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.derived import INERTIALESS
 
 
 def choose_units(scene: Scene) -> Units:
@@ -57,7 +58,8 @@ def _group_row(scene: Scene, group: FiberGroup, units: Units) -> dict[str, Any]:
         weight = bead * (density - scene.gravity.fluid_density)
         gravity = weight * np.asarray(scene.gravity.acceleration) / units.force
     reduced = m - 1.0
-    has_inertia = scene.numerics.method != "overdamped"
+    has_inertia = scene.numerics.method not in INERTIALESS
+    keeps_length = group.inextensible or scene.numerics.method == "rigid_rod"
     stretching = math.pi * a * (group.axial_modulus / stress) / (2.0 * m)
     inner = max(1, round(reduced)) if reduced > 1e-9 else 0
     return {
@@ -65,7 +67,7 @@ def _group_row(scene: Scene, group: FiberGroup, units: Units) -> dict[str, Any]:
         "rest": 2.0 * a * m,
         "spacing": m,
         "stretching": stretching,
-        "compliance": 0.0 if group.inextensible else 1.0 / stretching,
+        "compliance": 0.0 if keeps_length else 1.0 / stretching,
         "bending": math.pi * a**3 * (group.bending_modulus / stress) / (8.0 * m),
         "mass": bead * density / units.mass if has_inertia else 0.0,
         "drag": 6.0 * math.pi * eta * a,
@@ -168,6 +170,7 @@ def build(
     scene: Scene, device: str, placement: Placement | None = None
 ) -> tuple[Model, State, dict[str, Any]]:
     """Model and state of a scene on `device`, and the report of the placement."""
+    scene = split_tables(scene)
     placement = placement or place_fibers(scene)
     p = precision(scene.numerics.precision)
     units = choose_units(scene)

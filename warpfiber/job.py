@@ -27,6 +27,7 @@ from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.simulation import BoxExhausted, Diverged, Simulation, preflight, with_device
 from warpfiber.stopping import Stopper
 from warpfiber.summary import Summary, versions
+from warpfiber.trial import after_trial
 
 LOOK_EVERY = 0.2  # s of wall time between looks at stop requests and the progress line
 PROFILE_STEPS = 5
@@ -74,6 +75,7 @@ class Job:
         faults = _faults_of(preflight, scene) + _faults_of(ResultFolder.check, out, overwrite)
         if faults:
             raise SceneError(faults)
+        scene = after_trial(scene, workers)
         simulation = Simulation(scene, workers=workers)
         folder = ResultFolder.create(out, scene.name, overwrite)
         job = cls(simulation, folder, progress=progress)
@@ -127,8 +129,10 @@ class Job:
         bound = f" ({warning}limit {limit.dt:.4g} s, {limit.term})"
         if not math.isfinite(limit.dt):
             bound = ""
+        numerics, reason = self.scene.numerics, self.scene.method_reason
+        chosen = f"method {numerics.method} by auto ({reason}), " if reason else ""
         return (
-            f"{model.fiber_count} fibers, {model.segment_count} segments, "
+            f"{chosen}{model.fiber_count} fibers, {model.segment_count} segments, "
             f"dt {self.simulation.dt:.4g} s{bound}, "
             f"{self.scene.numerics.precision} on {self.simulation.device}, "
             f"workers {self.simulation.method.workers}"
@@ -244,9 +248,8 @@ class Job:
         return "time", sum(t for t in times if t is not None) / count
 
     def _end_stage(self, stage: Stage) -> None:
-        where = f"strain {self.simulation.strain:.6g}"
-        if self.scene.flow is None:
-            where = f"time {self.simulation.time:.6g} s"
+        strain, seconds = self.simulation.strain, self.simulation.time
+        where = f"strain {strain:.6g}" if self.scene.flow else f"time {seconds:.6g} s"
         self.folder.log(f"stage '{stage.name}' ended at {where}")
         self.stage_index += 1
         self.stage_start = (self.simulation.strain, self.simulation.time)

@@ -75,10 +75,10 @@ def precision(name: str) -> Precision:
     return _PRECISIONS[name]
 
 
-# Slots of State.status. A sweep sets EXPIRED (the neighbor list), STRETCHED (a segment outgrew the
-# cells of the list) or TORN (a diverged fiber); the next step then only sets HALT and changes
-# nothing until the host has looked, so any number of steps may be queued. OVERFLOW bits say which
-# capacity of the list is too small.
+# Slots of State.status. A sweep sets EXPIRED (the neighbor list) or TORN (a diverged fiber); the
+# next step then only sets HALT and changes nothing until the host has looked, so any number of
+# steps may be queued. A build of the list sets STRETCHED (a segment outgrew its cells); OVERFLOW
+# bits say which of its capacities is too small.
 EXPIRED, TORN, STRETCHED, HALT, BAD_FIBER, OVERFLOW, PAIR_COUNT, ROW_NEED = range(8)
 STATUS_SIZE = 8
 OVERFLOW_ROW, OVERFLOW_PAIRS = 1, 2

@@ -108,6 +108,7 @@ class Summary:
             },
             "list": simulation.method.list_report(),
             "method": simulation.scene.numerics.method,
+            "method_reason": simulation.scene.method_reason,
             "steps": simulation.step_count,
             "dt": simulation.dt,
             **simulation.method.step_report(),

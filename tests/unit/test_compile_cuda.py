@@ -89,15 +89,25 @@ def test_a_kernel_without_cubin_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_every_pass_is_compiled_in_both_precisions() -> None:
     from warpfiber.passes.cells import ListFeatures, make_cell_kernels
+    from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
+    from warpfiber.passes.list_bound import make_list_bound
+    from warpfiber.passes.row_count import RowFeatures, make_row_count
     from warpfiber.passes.rows import make_row_kernels
 
     features = ListFeatures((True, True, True))
     listed = make_cell_kernels("float32", features) | make_row_kernels("float32", features)
+    contact = {
+        *make_row_count("float32", RowFeatures()),
+        *make_check_sweeps("float32", CheckFeatures()),
+        *make_list_bound("float32"),
+    }
     names = {kernel for kernel, _, _ in tool.kernels("float32")}
     assert names == {
         *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
-        *("step_begin chain_step largest_error step_end take_back".split()),
+        *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
+        *("rod_maps rod_step fill_rows".split()),
         *listed,
+        *contact,
     }
     assert tool.PRECISIONS == ("float32", "float64")
     assert make_clock("float32", False, False) in [made for *_, made in tool.kernels("float32")]

@@ -118,8 +118,25 @@ def test_stretched_segments(start: Start) -> None:
     check_list(sim, least=20)
 
 
+def test_cells_grow_with_what_they_hold(start: Start) -> None:
+    """A segment that outgrew the cells since the last build, by any length, loses no pair."""
+    kind = Kind(1, 4.0)
+    fibers, _ = random_fibers((kind,), 120, [42.0] * 3, seed=16)
+    sim = cell(start, (kind,), fibers, flow=SHEAR, box={"size": [42.0] * 3})
+    pairs = sim.method.list
+    for stretch in (1.04, 1.3, 1.9):
+        nodes = np.concatenate(fibers).reshape(-1, 2, 3)
+        middle = nodes.mean(axis=1, keepdims=True)
+        nodes[::7] = (middle + stretch * (nodes - middle))[::7]
+        sim.state.node_pos.assign(nodes.reshape(-1, 3).astype(sim.state.node_pos.numpy().dtype))
+        sim.method.refresh_list()
+        assert pairs.stretch_allowed >= stretch
+        check_list(sim, least=20)
+    assert sim.method.box_width > 8.0 * 1.9
+
+
 def test_rebuilt_when_outgrown(start: Start) -> None:
-    """The step after a segment outgrew the cells, the list is a new one and holds every pair."""
+    """Segments that outgrow the cells as they move widen them, and the list holds every pair."""
     kind = Kind(1, 4.0, modulus=1e-3)
     fibers, _ = random_fibers((kind,), 80, [42.0] * 3, seed=15)
     velocity = np.concatenate([5.0 * (nodes - nodes.mean(axis=0)) for nodes in fibers])

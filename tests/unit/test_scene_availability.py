@@ -51,12 +51,8 @@ segments = 26
 
 
 NOT_YET: list[tuple[dict[str, object], str]] = [
-    ({"numerics.method": "rigid_rod"}, "numerics.method"),
-    ({"numerics.method": "auto"}, "numerics.method"),
     ({"numerics.contact": "unilateral"}, "numerics.contact"),
     ({"flow.kind": "field", "flow.file": "a.npz"}, "flow.kind"),
-    ({"fibers.0.count": GONE, "fibers.0.layers": "layers.csv"}, "fibers.0.layers"),
-    ({"fibers.0.frozen": True}, "fibers.0.frozen"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible"),
     ({"fibers.0.shape": {"kind": "ring"}}, "fibers.0.shape.kind"),
     ({"contact.law": "hertz", "contact.lubrication": GONE}, "contact.law"),
@@ -64,7 +60,6 @@ NOT_YET: list[tuple[dict[str, object], str]] = [
     ({"contact.friction": 0.3}, "contact.friction"),
     ({"contact.wall_friction": 0.3}, "contact.wall_friction"),
     ({"wall": [{"name": "z+", "velocity": [1, 0, 0]}]}, "wall"),
-    ({"load": [{"force": [1, 0, 0]}]}, "load"),
     ({"stage.0.end_speed": 0.1}, "stage.0.end_speed"),
     ({"stage.0.save": True}, "stage.0.save"),
     ({"stage.0.kind": "settle"}, "stage.0.kind"),
@@ -122,6 +117,37 @@ def test_what_overdamped_cannot_run(changes: dict[str, object], key: str, advice
     assert advice in faults[0].remedy
 
 
+RODS = OVERDAMPED | {"numerics.method": "rigid_rod", "numerics.segments": GONE}
+NOT_RODS: list[tuple[dict[str, object], str, str]] = [
+    ({"contact": GONE}, "contact.law", "the default is not available"),
+    ({"contact.law": "exponential"}, "contact.law", "rods do not meet"),
+    ({"box.boundary": ["periodic", "wall", "wall"]}, "box.boundary", "wall is not available"),
+    ({"numerics.closure": "paper"}, "numerics.closure", 'use closure = "consistent"'),
+    ({"numerics.segments": 3}, "numerics.segments", "a rod is one segment"),
+    ({"numerics.reduced_beads": 4}, "numerics.reduced_beads", "a rod is one segment"),
+    ({"fibers.0.aspect_ratio": 1.5}, "fibers.0.aspect_ratio", "too short for one segment"),
+    ({"gravity": {}}, "fibers.0.density", "missing"),
+    ({"flow": GONE, "stage.0.end_time": 1}, "flow", "missing: rigid_rod moves fibers by drag"),
+]
+
+
+def test_rods_have_one_segment_and_nothing_to_solve() -> None:
+    given = {"numerics.integrator": "bdf2", "fibers.0.inextensible": True}
+    scene = scene_from_dict(changed(RODS | given))
+    assert scene.numerics.segments == scene.fibers[0].segments == 1
+    assert scene.numerics.closure == "consistent"
+    assert scene.numerics.integrator is None and scene.numerics.tolerance is None
+    for key in ("numerics.integrator", "fibers.0.inextensible"):
+        assert any(note.startswith(f"{key} has no effect") for note in scene.notes)
+
+
+@pytest.mark.parametrize(("changes", "key", "advice"), NOT_RODS)
+def test_what_rods_cannot_run(changes: dict[str, object], key: str, advice: str) -> None:
+    faults = faults_of(changed(RODS | changes))
+    assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
+    assert advice in faults[0].remedy
+
+
 SPHERES: dict[str, object] = {
     "numerics.method": "bonded_spheres",
     "flow": GONE,
@@ -144,11 +170,6 @@ NOT_SPHERES: list[tuple[dict[str, object], str, str]] = [
     ({"fibers.0.poisson_ratio": 0.6}, "fibers.0.poisson_ratio", "0.5"),
     ({"fibers.0.density": GONE}, "fibers.0.density", "missing"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible", "axial_modulus"),
-    ({"load": [{"group": 1}]}, "load.0.group", "there are 1"),
-    ({"load": [{"fiber": 10}]}, "load.0.fiber", "the group has 10"),
-    ({"load": [{"node": -5}]}, "load.0.node", "the group has 4"),
-    ({"load": [{"velocity": [1, 0, 0]}]}, "load.0.velocity", 'hold = "free"'),
-    ({"load": [{"hold": "clamp", "force": [1, 0, 0]}]}, "load.0.force", 'hold = "clamp"'),
 ]
 
 
@@ -179,14 +200,6 @@ def test_start_is_known() -> None:
     """[start] is not available, and does not go with [[fibers]] and [box]."""
     faults = faults_of(changed({"start": {"from": "results/a", "stage": "load"}}))
     assert [fault.key for fault in faults] == ["start", "fibers", "box"]
-
-
-def test_length_distribution_is_known() -> None:
-    """A length distribution is read whole and told to be not available."""
-    weibull = {"kind": "weibull", "number_average": 1e-3, "weight_average": 2e-3}
-    changes: dict[str, object] = {"fibers.0.aspect_ratio": GONE}
-    faults = faults_of(changed(changes | {"fibers.0.length_distribution": weibull}))
-    assert [fault.key for fault in faults] == ["fibers.0.length_distribution"]
 
 
 def test_bonded_spheres_scene_has_only_known_keys() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import warpfiber as wf
-from warpfiber.model import STRETCHED
+from warpfiber.model import EXPIRED
 
 CELL = """
 [box]
@@ -128,11 +128,10 @@ def test_timing_passes_leaves_nothing_pending(tmp_path: Path) -> None:
     simulation.step()
     pairs = simulation.method.list
     assert pairs is not None
-    allowed, builds = pairs.stretch_allowed, pairs.build_count
+    builds = pairs.build_count
     status = simulation.state.status.numpy()
-    status[STRETCHED] = 1
+    status[EXPIRED] = 1
     simulation.state.status.assign(status)
     simulation.pass_times(1)
-    assert pairs.stretch_allowed > allowed
     assert pairs.build_count == builds + 1
-    assert simulation.state.status.numpy()[STRETCHED] == 0
+    assert simulation.state.status.numpy()[EXPIRED] == 0

@@ -21,14 +21,13 @@ from warpfiber.methods.box_limits import bearable_strain, lasting_height
 from warpfiber.methods.method import Method
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
 from warpfiber.methods.step_launches import step_launches
-from warpfiber.model import EXPIRED, PAIR_COUNT, STRETCHED, TORN, Model, State
-from warpfiber.passes.executor import Call, Launch
+from warpfiber.model import EXPIRED, PAIR_COUNT, TORN, Model, State
+from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
-STRETCH_GROWTH = 1.2  # how much longer segments may be after they outgrew the cells of the list
 
 
 def contact_reach(scene: Scene) -> float:
@@ -77,7 +76,7 @@ class BeadChain(Method):
             self.check_box()
         self._allocate_pair_results()
 
-    def launches(self) -> list[Launch | Call]:
+    def launches(self) -> list[Launch | Call | Repeat]:
         """Clock, pairs and nodes."""
         return [*step_launches(self)]
 
@@ -134,14 +133,13 @@ class BeadChain(Method):
     # -- the step ---------------------------------------------------------------------------------
 
     def set_stretch(self, stretch: float) -> None:
-        """Take over the stretch that a saved run's list allowed; the next list and step use it."""
+        """Take over the stretch that cells must hold; the next list uses it."""
         pairs, choice = self.list, self.skin
         assert pairs is not None and choice is not None
         pairs.set_stretch(stretch)
         choice.largest = self._largest_skin(choice.start, choice.radius)
         self.set_skin(min(choice.skin, choice.largest))
         self.check_box()
-        self._stop_executor()
 
     def set_skin(self, skin: float) -> None:
         """Take over a skin; the next list and step use it."""
@@ -154,8 +152,13 @@ class BeadChain(Method):
         """Build the neighbor list now (also clears its expiry)."""
         if self.list is None:
             return
-        begin = time.perf_counter()
-        replaced = self.list.build(wrap=wrap)
+        pairs = self.list
+        begin, allowed, skin = time.perf_counter(), pairs.stretch_allowed, pairs.skin
+        replaced = pairs.build(wrap=wrap)
+        if pairs.stretch_allowed > allowed:  # wider cells may leave less room for the skin
+            self.set_stretch(pairs.stretch_allowed)
+            if pairs.skin < skin:
+                replaced |= pairs.build(wrap=False)
         self.list_seconds += time.perf_counter() - begin
         assert self.skin is not None
         self.skin.built(self.step_count)
@@ -194,16 +197,11 @@ class BeadChain(Method):
     def _settle(self) -> bool:
         """Do what halted the steps asks for, so that nothing is pending; False if a fiber tore."""
         status = self._status()
-        torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
-        if torn:
+        if status[TORN]:
             return False
-        if stretched and self.list is not None:
-            self.set_stretch(STRETCH_GROWTH * self.list.stretch_allowed)
-            self.state.status.zero_()
-        elif expired and self.list is not None and self.skin is not None:
+        if status[EXPIRED] and self.list is not None and self.skin is not None:
             listed = float(status[PAIR_COUNT]) / self.model.segment_count
             self.set_skin(self.skin.choose(self.step_count, listed))
-        if expired or stretched:
             self.refresh_list()
         return True
 

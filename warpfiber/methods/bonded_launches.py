@@ -12,7 +12,6 @@ from warpfiber.passes.bonds import make_bond_sweep
 from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
-from warpfiber.passes.nodes import TEAR_STRETCH
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -103,7 +102,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     gathered: list[Any] = [none_i, none_i, none_i, spheres.pair_acts, none_3, none_3]
     gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
     if spheres.contacts is not None:
-        pairs, contacts = spheres.contacts.list, spheres.contacts
+        pairs, contacts = spheres.contacts.search.list, spheres.contacts
         gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
         gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
     inputs = [
@@ -112,7 +111,6 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         high,
         p.real(spheres.scene.contact.damping),
         p.real(spheres.scene.contact.wall_friction),
-        p.real((spheres.list.stretch_allowed if spheres.list else 0.0) / TEAR_STRETCH),
         spheres.stage,
         spheres.groups,
         model.fiber_node_start,

@@ -26,9 +26,10 @@ from warpfiber.methods.bonded_launches import (
     pair_launch,
     wall_places,
 )
-from warpfiber.methods.box_limits import bearable_strain
+from warpfiber.methods.loads import node_loads
 from warpfiber.methods.method import Method
-from warpfiber.model import EXPIRED, STRETCHED, TORN, Model, State
+from warpfiber.model import EXPIRED, TORN, Model, State
+from warpfiber.passes import held_nodes
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import (
@@ -40,10 +41,10 @@ from warpfiber.passes.bonds import (
     STAGE_SIZE,
     BondFeatures,
 )
-from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
-from warpfiber.scene import FiberGroup, Scene, Stage
+from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 
 STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
@@ -52,7 +53,6 @@ _CARRIED = (
     "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place "
     "wall_memory wall_stiffness"
 ).split()
-_HOLDS = {"free": FREE, "position": HELD, "clamp": CLAMPED}
 
 
 class BondedSpheres(Method):
@@ -69,7 +69,7 @@ class BondedSpheres(Method):
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
-            loads=bool(scene.loads),
+            loads=bool(scene.loads) or any(group.frozen for group in scene.fibers),
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
             wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
@@ -104,9 +104,8 @@ class BondedSpheres(Method):
         if self.features.pairs:
             stretch = float(self._segment_stretch().max())
             self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
-            self.list, self.skin = self.contacts.list, self.contacts.skin
+            self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
-            self.strain_end = bearable_strain(scene, self.box_width * model.units.length)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -148,24 +147,28 @@ class BondedSpheres(Method):
         return chord / length[:, None], length
 
     def _loads(self) -> tuple[np.ndarray, np.ndarray]:
-        """How every node is held, and its force, or its velocity where it is held."""
-        model, units = self.model, self.model.units
-        count = model.node_count if self.features.loads else 0
-        hold, load = np.zeros(count, dtype=np.int32), np.zeros((count, 3))
+        """How every node is held, and its force, or its velocity where it is held.
+
+        A clamp holds one node and its orientation: that is its segment's at this end.
+        """
+        scene, model = self.scene, self.model
+        imposed, load = node_loads(scene, model)
+        hold = np.full(len(imposed), FREE, dtype=np.int32)
+        hold[imposed == held_nodes.HELD] = HELD
+        hold[imposed == held_nodes.FROZEN] = CLAMPED
         start, group = model.host["fiber_node_start"], model.host["fiber_group"]
-        for entry in self.scene.loads:
-            fiber = np.flatnonzero(group == entry.group % len(self.scene.fibers))[entry.fiber]
-            node = np.arange(start[fiber], start[fiber + 1])[entry.node]
-            hold[node] = _HOLDS[entry.hold]
-            if entry.hold == "free":
-                load[node] += np.asarray(entry.force or (0.0, 0.0, 0.0)) / units.force
-            else:
-                load[node] = np.asarray(entry.velocity or (0.0, 0.0, 0.0)) / units.velocity
+        for row in scene.loads:
+            if row.hold == "clamp" and not scene.fibers[row.group].frozen:
+                fiber = np.flatnonzero(group == row.group)[row.fiber]
+                nodes = np.arange(start[fiber], start[fiber + 1])
+                clamped = nodes[row.node]
+                other = clamped + 1 if clamped < nodes[-1] else clamped - 1
+                hold[clamped], hold[other], load[other] = CLAMPED, FREE, 0.0
         return hold, load
 
     # -- the step ---------------------------------------------------------------------------------
 
-    def launches(self) -> list[Launch | Call]:
+    def launches(self) -> list[Launch | Call | Repeat]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
         if self.contacts is None:
             return [clock_launch(self), bond_launch(self, drifts=True, kicks=True)]
@@ -179,9 +182,7 @@ class BondedSpheres(Method):
     @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units; with the start skin."""
-        if self.list is None or self.skin is None:
-            return 0.0
-        return self.list.cell_width - self.list.skin + self.skin.start
+        return self.contacts.search.box_width if self.contacts is not None else 0.0
 
     def prepare(self, measuring: Iterable[Any] = ()) -> None:
         """Compile and capture; find the accelerations of the start."""
@@ -196,7 +197,7 @@ class BondedSpheres(Method):
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        first: list[Launch | Call] = [bond_launch(self, drifts=False, kicks=False)]
+        first: list[Launch | Call | Repeat] = [bond_launch(self, drifts=False, kicks=False)]
         if self.contacts is not None:
             if self.contacts.build(self.step_count):
                 self._stop_executor()
@@ -209,20 +210,27 @@ class BondedSpheres(Method):
     def _settle(self) -> bool:
         """Build the list anew if it has expired; False if a fiber tore."""
         status = self._status()
-        torn, expired, stretched = (bool(status[slot]) for slot in (TORN, EXPIRED, STRETCHED))
-        if torn:
+        if status[TORN]:
             return False
-        if (expired or stretched) and self.contacts is not None:
-            if self.contacts.expire(self.step_count, stretched):
+        if status[EXPIRED] and self.contacts is not None:
+            replaced = self.contacts.expire(self.step_count)
+            if replaced is None:
+                remedy = "fibers move farther in one step than any skin; give a smaller dt"
+                raise SceneError([Fault(self.scene.path, "numerics.dt", None, remedy)])
+            if replaced:
                 self._stop_executor()
-            self.list_seconds = self.contacts.seconds
+            self.list_seconds = self.contacts.search.seconds
         return True
+
+    def list_report(self) -> dict[str, float]:
+        """What the search for pairs did; nothing without a list."""
+        return self.contacts.search.report(self.step_count) if self.contacts is not None else {}
 
     def close(self) -> None:
         """Stop worker threads."""
         super().close()
-        if self.list is not None:
-            self.list.close()
+        if self.contacts is not None:
+            self.contacts.search.close()
 
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
         """Take over the damping of a stage; count anew how long all nodes have been still."""

@@ -16,8 +16,8 @@ import numpy as np
 import warp as wp
 
 from warpfiber.methods.skin import SkinChoice
-from warpfiber.model import BAD_FIBER, EXPIRED, STRETCHED, TORN, Model, State
-from warpfiber.passes.executor import Call, Executor, Launch, load_kernels
+from warpfiber.model import BAD_FIBER, EXPIRED, TORN, Model, State
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat, flat, load_kernels
 from warpfiber.passes.measure import TERMS
 from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
@@ -59,7 +59,7 @@ class Method(ABC):
         self.pair_force = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
 
     @abstractmethod
-    def launches(self) -> list[Launch | Call]:
+    def launches(self) -> list[Launch | Call | Repeat]:
         """The launches of one step."""
 
     def _choose_workers(self, workers: int | None) -> int:
@@ -97,7 +97,7 @@ class Method(ABC):
         """
         if self.executor is None:
             launches = self.launches()
-            stepping = [launch.kernel for launch in launches if isinstance(launch, Launch)]
+            stepping = [launch.kernel for launch in flat(launches) if isinstance(launch, Launch)]
             load_kernels([*stepping, *measuring], self.model.device)
             self.executor = Executor(launches, self.model.device, self.workers)
 
@@ -126,7 +126,7 @@ class Method(ABC):
 
     def _halted(self) -> bool:
         status = self._status()
-        return bool(status[EXPIRED] or status[TORN] or status[STRETCHED])
+        return bool(status[EXPIRED] or status[TORN])
 
     def _status(self) -> np.ndarray:
         """The status words: on the CPU a view that is made once, looked at after every graph."""
@@ -206,8 +206,9 @@ class Method(ABC):
         fiber = int(state.status.numpy()[BAD_FIBER])
         if len(bad):  # several may have torn in one step, in any order
             fiber = int(model.host["segment_fiber"][bad[0]])
+        stored = self.list if self.pair_acts.shape[0] else None  # forces by listed pair
         sizes = measure_fiber_terms(
-            model, state, fiber, self.flow_origin, self.list, self.pair_acts, self.pair_force
+            model, state, fiber, self.flow_origin, stored, self.pair_acts, self.pair_force
         )
         mine = stretch[model.host["segment_fiber"] == fiber]
         worst = int(np.argmax(np.where(np.isfinite(mine), mine, math.inf)))

@@ -7,7 +7,10 @@ Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with th
     hydrodynamic torque C). Contact: two touching beads with the stiffness of the repulsion at an
     overlap of 0.1 a. Lubrication, where it is not limited: C of two beads at the inner end of its
     range, h = 0.001 a. Flow: accuracy, not stability; a strain of 0.02.
-Symbols: all SI, per bead; matrices per node of a fiber.
+    A matrix is positive where all pivots of its elimination are (Sylvester 1852), and no node acts
+    beyond the next but one: a test of one dt takes as many operations as there are nodes.
+Symbols: all SI, per bead; matrices per node of a fiber, by their diagonals: row d of `Bands`
+    couples node i with i + d.
 Limits: bent fibers and several contacts on one bead lower the true limit; `dt_fraction` covers
     them.
 """
@@ -21,14 +24,13 @@ from functools import lru_cache
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
-from warpfiber.laws.hertz import DASHPOT
-from warpfiber.methods.bond_constants import bond_constants
+from warpfiber.methods.bond_steps import bond_steps
 from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.derived import INERTIALESS
 
-Matrix = np.ndarray
-CONTACT_OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
-LONGEST_CHAIN = 16  # segments; longer fibers of bonded spheres have the same limit
+Bands = np.ndarray  # (3, nodes), symmetric
+CONTACT_OVERLAP = 0.1  # radii, where the stiffness of the exponential repulsion is taken
 LUBRICATION_GAP = 0.001  # radii, inner end of the lubrication range
 FLOW_STRAIN = 0.02  # largest strain of a step
 
@@ -44,12 +46,12 @@ class StepLimit:
     """what a step up to it is: `stable`, or `accurate` where the flow decides"""
 
 
-def stable_limit(stiffness: Matrix, damping: Matrix, mass: Matrix, drag: Matrix) -> float:
-    """Largest stable step in s of symmetric matrices (n, n), by bisection; inf without a limit."""
+def stable_limit(stiffness: Bands, damping: Bands, mass: Bands, drag: Bands) -> float:
+    """Largest stable step in s, by bisection; inf without a limit."""
 
     def is_stable(dt: float) -> bool:
         rest = 4.0 * np.maximum(mass, 0.5 * dt * drag) - 2.0 * dt * damping - dt * dt * stiffness
-        return bool(np.linalg.eigvalsh(rest)[0] > 0.0)
+        return _is_positive(rest)
 
     low, high = 1e-30, 1e30
     if is_stable(high):
@@ -60,34 +62,59 @@ def stable_limit(stiffness: Matrix, damping: Matrix, mass: Matrix, drag: Matrix)
     return low
 
 
+def _is_positive(matrix: Bands) -> bool:
+    """Whether all eigenvalues are positive."""
+    off = here = after = 0.0  # what the eliminated nodes take from the entries ahead
+    for diagonal, next_one, next_but_one in zip(*matrix.tolist(), strict=True):
+        pivot = diagonal - here
+        if not pivot > 0.0:
+            return False
+        couple = next_one - off
+        off = couple * next_but_one / pivot
+        here = after + couple * couple / pivot
+        after = next_but_one * next_but_one / pivot
+    return True
+
+
 def _bead_limit(stiffness: float, damping: float, mass: float, drag: float) -> float:
     """The same for one bead, all in SI."""
-    return stable_limit(*(np.array([[value]]) for value in (stiffness, damping, mass, drag)))
+    return stable_limit(*(_diagonal(np.array([v])) for v in (stiffness, damping, mass, drag)))
 
 
-def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[Matrix, ...]:
+def _diagonal(values: np.ndarray) -> Bands:
+    return np.stack([values, np.zeros_like(values), np.zeros_like(values)])
+
+
+def _gram(row: tuple[float, ...], weight: np.ndarray) -> Bands:
+    """Sum of weight[k] r_k r_k^T, where r_k is this row of numbers from node k on."""
+    bands = np.zeros((3, len(weight) + len(row) - 1))
+    for i, x in enumerate(row):
+        for d, y in enumerate(row[i:]):
+            bands[d, i : i + len(weight)] += weight * x * y
+    return bands
+
+
+def _matrices(group: FiberGroup, eta: float, weights: str) -> tuple[Bands, ...]:
     """Axial and transverse stiffness, torque damping and Galerkin matrix of a straight fiber."""
     n, a, m = group.segments, group.radius, group.bead_spacing
     rest = 2.0 * a * m
     k_s = math.pi * a * group.axial_modulus / (2.0 * m)
     k_b = math.pi * a**3 * group.bending_modulus / (8.0 * m)
-    first = np.diff(np.eye(n + 1), axis=0)
     weight = np.full(n, m)
     if weights == "end_weighted":
         weight[0] += 0.5
         weight[-1] += 0.5
-    axial = k_s * first.T @ first
-    second = np.diff(np.eye(n + 1), n=2, axis=0) if n > 1 else np.zeros((0, n + 1))
-    bending = k_b / rest**2 * second.T @ second
-    torque = first.T @ np.diag(8.0 * math.pi * eta * a**3 * weight / rest**2) @ first
+    axial = _gram((-1.0, 1.0), np.full(n, k_s))
+    bending = _gram((1.0, -2.0, 1.0), np.full(n - 1, k_b / rest**2))
+    torque = _gram((-1.0, 1.0), 8.0 * math.pi * eta * a**3 * weight / rest**2)
     end, inner, off = galerkin_entries(m)
-    galerkin = np.diag(np.full(n + 1, inner))
-    galerkin[0, 0] = galerkin[-1, -1] = end
-    galerkin += off * (np.eye(n + 1, k=1) + np.eye(n + 1, k=-1))
+    galerkin = _diagonal(np.full(n + 1, inner))
+    galerkin[0, [0, -1]] = end
+    galerkin[1, :-1] = off
     return axial, bending, torque, galerkin
 
 
-def _published_closure(n: int, m: float) -> tuple[Matrix, ...]:
+def _published_closure(n: int, m: float) -> tuple[Bands, ...]:
     """Inertia and drag of a straight fiber along and across it, in beads per node.
 
     m dv/dt = a F^ND + b F^D is the same as (m / a) dv/dt = F^ND + (b / a) F^D. Along: alpha^T and
@@ -107,25 +134,25 @@ def _published_closure(n: int, m: float) -> tuple[Matrix, ...]:
         # beta^R / alpha^R of Eq. (8) for a parabola, where n_i - n_(i-1) = -24 / (n (n + 2)) N3_i
         drag_along[middle] = m - 4.0 * (m * m - 1.0) / (m * n * (n + 2.0))
     # beta = alpha times the drag of a node in beads, for both directions
-    return np.diag(1.0 / along), np.diag(drag_along), np.diag(1.0 / across), np.diag(drag_across)
+    both = (1.0 / along, drag_along), (1.0 / across, drag_across)
+    return tuple(_diagonal(values) for pair in both for values in pair)
 
 
 def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
     if scene.numerics.method == "bonded_spheres":
-        return _bond_limits(scene, index)
+        return [StepLimit(term, dt, index) for term, dt in bond_steps(scene, group).items()]
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
     mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)
     zeta = 6.0 * math.pi * eta * a
     axial, bending, torque, galerkin = _matrices(group, eta, scene.numerics.torque_weights)
     n = group.segments
-    eye = np.eye(n + 1)
     closure = scene.numerics.closure
     if closure == "paper":
         axial_inertia, axial_drag, inertia, drag = _published_closure(n, m)
     else:
-        inertia = drag = galerkin if closure == "consistent" else eye
+        inertia = drag = galerkin if closure == "consistent" else _diagonal(np.ones(n + 1))
         axial_inertia, axial_drag = inertia, drag
     still = np.zeros_like(axial)
     limits = [
@@ -158,50 +185,14 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     return limits
 
 
-def _bond_limits(scene: Scene, index: int) -> list[StepLimit]:
-    """Motions along, about and across a straight fiber of bonded spheres, and its end at a wall.
-
-    A turn counts as t = l times the angle, so that all entries are masses and stiffnesses. Across,
-    the shear of a bond is w1 - w0 - (t0 + t1) / 2 and its bending (t1 - t0) / l.
-    """
-    group = scene.fibers[index]
-    c = bond_constants(scene, group)
-    n = min(group.segments, LONGEST_CHAIN)
-    arm = c.segment_length**-2
-    after, before = np.eye(n, n + 1, k=1), np.eye(n, n + 1)
-    first, still = after - before, np.zeros((n, n + 1))
-    shear = np.concatenate([first, -0.5 * (after + before)], axis=1)
-    bending = np.concatenate([still, first], axis=1)
-    mass = np.full(n + 1, c.mass)
-    mass[[0, -1]] = c.end_mass
-    turning = np.full(n + 1, c.inertia * arm)
-    turning[[0, -1]] = c.end_inertia * arm
-
-    def limit(inertia: Matrix, *parts: tuple[int, float, Matrix]) -> float:
-        size = len(inertia)
-        stiffness, damping = np.zeros((size, size)), np.zeros((size, size))
-        for mode, factor, strain in parts:
-            stiffness += c.stiffness[mode] * factor * strain.T @ strain
-            damping += c.dashpots[mode] * factor * strain.T @ strain
-        return stable_limit(stiffness, damping, np.diag(inertia), np.zeros((size, size)))
-
-    steps = {
-        "bond stretching": limit(mass, (0, 1.0, first)),
-        "bond shear and bending": limit(
-            np.concatenate([mass, turning]), (1, 1.0, shear), (2, arm, bending)
-        ),
-        "bond twist": limit(turning, (3, arm, first)),
-    }
-    if scene.box is not None and "wall" in scene.box.boundary:
-        stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(CONTACT_OVERLAP)
-        resistance = DASHPOT * scene.contact.damping * math.sqrt(stiffness * c.end_mass)
-        steps["walls"] = _bead_limit(stiffness, resistance, c.end_mass, 0.0)
-    return [StepLimit(term, dt, index) for term, dt in steps.items()]
-
-
 @lru_cache(maxsize=4)
 def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
-    """All limits of all groups, smallest first; `overdamped` has none but the strain of a step."""
+    """All limits of all groups, smallest first.
+
+    `overdamped` has none but the strain of a step, `rigid_rod` none at all.
+    """
+    if scene.numerics.method == "rigid_rod":
+        return (StepLimit("none: maps of the flow are exact", math.inf, 0, "accurate"),)
     if scene.numerics.method == "overdamped":
         dt = largest_step(scene)
         return (StepLimit(f"accuracy: a strain of {LARGEST_STRAIN}", dt, 0, "accurate"),)
@@ -212,7 +203,7 @@ def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
 def chosen_step(scene: Scene) -> float:
     """dt in s: given (or from the strain step), or `dt_fraction` of the smallest limit."""
     numerics = scene.numerics
-    if numerics.method == "overdamped":
+    if numerics.method in INERTIALESS:
         return strain_step(scene)
     if numerics.dt is not None:
         return numerics.dt

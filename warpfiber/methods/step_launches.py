@@ -9,6 +9,7 @@ import warp as wp
 
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.native import LANES
 from warpfiber.passes.native_nodes import (
     fiber_blocks,
@@ -40,7 +41,7 @@ def clock_launch(chain: BeadChain) -> Launch:
     """Time, strain, velocity gradient and lattice of the step."""
     model, state = chain.model, chain.state
     scheduled = len(chain.schedule) > 1
-    clock = make_clock(model.precision.name, model.domain.sheared, scheduled)
+    clock = make_clock(model.precision.name, model.domain.sheared, scheduled, _node_module(chain))
     return Launch(
         "clock",
         clock,
@@ -62,8 +63,22 @@ def clock_launch(chain: BeadChain) -> Launch:
     )
 
 
+def _node_module(chain: BeadChain) -> str:
+    """The clock and the node sweep are launched together; pairs serve many node sweeps."""
+    model = chain.model
+    scheduled = len(chain.schedule) > 1
+    name, sheared = model.precision.name, model.domain.sheared
+    return kernel_module(
+        "nodes", name, node_features(chain), _has_native_nodes(chain), sheared, scheduled
+    )
+
+
+def _has_native_nodes(chain: BeadChain) -> bool:
+    return chain.native_nodes and native_nodes_apply(chain.model, node_features(chain))
+
+
 def pair_launch(chain: BeadChain) -> Launch:
-    """Forces of all listed pairs: by blocks of pairs on the CPU, else by segments."""
+    """Forces of all listed pairs: by blocks of pairs on the CPU, else one by one."""
     model, state, p, pairs = chain.model, chain.state, chain.model.precision, chain.list
     assert pairs is not None
     inputs = [
@@ -78,7 +93,7 @@ def pair_launch(chain: BeadChain) -> Launch:
         model.segment_fiber,
         state.gradient,
         state.lattice_now,
-        pairs.pair_i if chain.native else pairs.out_start,
+        pairs.pair_i,
         pairs.pair_j,
         pairs.pair_image,
         state.node_pos,
@@ -95,7 +110,7 @@ def pair_launch(chain: BeadChain) -> Launch:
         chunks = native_chunks(model.segment_count)
         return Launch("pairs", kernel, chunks, [chunks, *inputs], split=True)
     kernel = make_pair_sweep(p.name, chain.pair_features)
-    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
+    return Launch("pairs", kernel, pairs.pair_capacity, inputs, split=True)
 
 
 def _lubrication_dt(chain: BeadChain) -> float:
@@ -109,7 +124,7 @@ def _lubrication_dt(chain: BeadChain) -> float:
 
 def node_launch(chain: BeadChain) -> Launch:
     """Internal and gathered forces, closure and the step of every fiber."""
-    if chain.native_nodes and native_nodes_apply(chain.model, node_features(chain)):
+    if _has_native_nodes(chain):
         return native_node_launch(chain)
     return plain_node_launch(chain)
 
@@ -131,7 +146,7 @@ def node_features(chain: BeadChain) -> NodeFeatures:
 def plain_node_launch(chain: BeadChain) -> Launch:
     """The node sweep with one thread per fiber."""
     model = chain.model
-    sweep = make_node_sweep(model.precision.name, node_features(chain))
+    sweep = make_node_sweep(model.precision.name, node_features(chain), _node_module(chain))
     return Launch("nodes", sweep, model.fiber_count, _node_inputs(chain), split=True)
 
 
@@ -148,7 +163,7 @@ def native_node_launch(chain: BeadChain) -> Launch:
         wp.array(fibers.ravel(), dtype=wp.int32, device=model.device),
         wp.array(own, dtype=wp.int32, device=model.device),
     ]
-    sweep = make_native_node_sweep(name, node_features(chain))
+    sweep = make_native_node_sweep(name, node_features(chain), _node_module(chain))
     return Launch("nodes", sweep, len(own), inputs, split=True)
 
 
@@ -165,7 +180,6 @@ def _node_inputs(chain: BeadChain) -> list[Any]:
         p.real(chain.strength),
         p.real(chain.decay),
         pairs.skin_out if pairs else wp.zeros(0, dtype=p.real, device=model.device),
-        p.real(pairs.stretch_allowed if pairs else 0.0),
         model.groups,
         model.pivots,
         model.fiber_node_start,

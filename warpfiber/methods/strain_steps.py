@@ -11,6 +11,7 @@ import math
 from warpfiber.scene import Scene
 
 AUTO_STRAIN = 0.05  # strain per step of `auto`, and of the first step with a tolerance
+SLIP = 2.0  # radii that both tips of a fiber across the gradient move per unit strain and r_f
 LARGEST_STRAIN = 0.2  # strain per step above which a turn is no longer followed
 
 
@@ -29,7 +30,15 @@ def largest_step(scene: Scene) -> float:
 
 def step_start(scene: Scene) -> float:
     """dt in s of `auto`; inf in a fluid at rest."""
-    return largest_step(scene) * (AUTO_STRAIN / LARGEST_STRAIN)
+    return largest_step(scene) * (auto_strain(scene) / LARGEST_STRAIN)
+
+
+def auto_strain(scene: Scene) -> float:
+    """Strain per step of `auto`: tips of fibers that meet slip by no more than a radius."""
+    longest = max((group.aspect_ratio for group in scene.fibers), default=0.0)
+    if scene.contact.law == "none" or longest == 0.0:
+        return AUTO_STRAIN
+    return min(AUTO_STRAIN, SLIP / longest)
 
 
 def strain_step(scene: Scene) -> float:

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpfiber.laws.bond import make_bond
 from warpfiber.laws.rotation import make_rotation
-from warpfiber.model import BAD_FIBER, HALT, STRETCHED, TORN, precision
+from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.capsule_pairs import make_gather
 from warpfiber.passes.node_walls import make_node_walls
@@ -102,7 +102,6 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         wall_high: wp.vec3d,
         wall_damping: real,
         wall_friction: real,
-        stretch_allowed: real,
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -141,7 +140,6 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         nothing = vec3(zero, zero, zero)
         torn2 = g.torn_length * g.torn_length
         torn = wp.int32(0)
-        longest2 = zero
         fastest2 = zero
 
         # A ring's last bond pulls at the first node now and at the last node in the end.
@@ -203,7 +201,6 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     moment += couple
                     force_after += push_after
                     moment_after += couple_after
-                    longest2 = wp.max(longest2, length2)
 
             mass = g.mass
             inertia = g.inertia
@@ -267,10 +264,6 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
             if fastest2 < stage[wp.static(END_SPEED)]:
                 count = still_steps[fiber] + 1
             still_steps[fiber] = count
-        if wp.static(has_pairs):
-            allowed = stretch_allowed * g.torn_length
-            if longest2 > allowed * allowed:
-                status[wp.static(STRETCHED)] = 1
         if torn == 1:
             status[wp.static(TORN)] = 1
             status[wp.static(BAD_FIBER)] = fiber

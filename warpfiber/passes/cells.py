@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.model import EXPIRED, OVERFLOW, ROW_NEED, precision
+from warpfiber.model import EXPIRED, OVERFLOW, ROW_NEED, STRETCHED, precision
 from warpfiber.passes.pairs import IMAGE_BITS, image_code
 
 MAX_CELLS_PER_PIECE = 4
@@ -51,7 +51,9 @@ FETCH_AHEAD = r"""
 
 
 @cache
-def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
+def make_cell_kernels(
+    name: str, features: ListFeatures, native: bool = False, module: str = "unique"
+):
     """`place_fibers`, `start_list`, `bin_pieces`, `gather_pieces` as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -62,7 +64,7 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
     sheared = features.sheared
     pieces = features.pieces
     half = wp.float64(0.5)
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func
     def wrap_count(x: wp.vec3d) -> wp.vec3i:
@@ -179,6 +181,7 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
                 frame_out[9 + 3 * row + col] = wp.float32(h[row, col])
         status[wp.static(EXPIRED)] = 0
         status[wp.static(OVERFLOW)] = 0
+        status[wp.static(STRETCHED)] = 0
         status[wp.static(ROW_NEED)] = 0
 
     @wp.kernel(**options)
@@ -222,6 +225,7 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
         offset: wp.int32,
         stride: wp.int32,
         low: wp.vec3d,
+        sizes: wp.array(dtype=wp.float64),
         lattice: wp.array(dtype=wp.mat33d),
         order: wp.array(dtype=wp.int32),
         piece_wrap: wp.array(dtype=wp.int32),
@@ -235,6 +239,7 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
         segment_out: wp.array(dtype=wp.int32),
         wrap_out: wp.array(dtype=wp.int32),
         part_out: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
     ):
         """Copies in the order of the cells: the segment as it is, its piece wrapped in float32."""
         k = wp.tid() + offset
@@ -273,7 +278,10 @@ def make_cell_kernels(name: str, features: ListFeatures, native: bool = False):
         for axis_number in range(3):
             planes_out[axis_number * stride + k] = wp.float32(middle[axis_number])
             planes_out[(axis_number + 3) * stride + k] = wp.float32(half_axis[axis_number])
-        planes_out[6 * stride + k] = wp.float32(wp.length(half_axis))
+        half_length = wp.length(half_axis)
+        planes_out[6 * stride + k] = wp.float32(half_length)
+        if half_length > half * sizes[1]:
+            status[wp.static(STRETCHED)] = 1
 
     local = locals()
     names = "place_fibers start_list bin_pieces gather_pieces"

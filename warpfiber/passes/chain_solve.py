@@ -12,6 +12,8 @@ Source: linearly implicit steps of (R + T) v = R u + F_Omega - B x + F_lambda wi
         SDIRK2 2  h = chi dt   a = 1/chi  b = 1    m = X_1 - x              lambda* of stage 1
 Symbols: W lower block of a row as rows w0, w1, w2 and column wt of the impulse; L = W D^-1 alike;
     D^-1 = [[P, q], [q^T, s]], P symmetric as diagonal (xx, yy, zz) and off (xy, xz, yz).
+    A held node has a known delta_i = h V - w: its inverse block keeps the impulse alone, exactly
+    what an endless drag would leave.
 Limits: a pivot that is not positive (compression buckles within a step) repeats the solve without
     the negative tensions in the matrix: the same order, damped.
 """
@@ -26,15 +28,21 @@ from warpfiber.laws.flow import make_flow
 from warpfiber.laws.torque import make_torque
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.elimination import elimination_row, make_sym_algebra
+from warpfiber.passes.held_nodes import FREE, FROZEN, make_held
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.precision import group_struct
 
 CHI = 1.0 - 1.0 / math.sqrt(2.0)
+# LLVM's own limits of inlining and vectorizing; with those that Warp sets a solve takes 1/3 longer
+OPTIONS = {"cpu_compiler_flags": "-march=native"}
 
 
 @cache
-def make_chain_step(name: str):
+def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
     """Kernel `chain_step`: one step of BDF2 (`stages` 1) or SDIRK2 (2) of every fiber.
+
+    `loaded`: nodes have a force or, as `node_hold` says, a velocity in `node_load`, and frozen
+    fibers are left to `carry_fibers`; `sheared`: stored images move with the flow.
 
     `keeps`: steps may be rejected, so the state of the start is kept and a tear left to the error.
     `row_stride`: rows per fiber in `rows`; negative if all fibers of a launch share the first's.
@@ -47,11 +55,12 @@ def make_chain_step(name: str):
     torque_couple = make_torque(name)
     drag_diagonal, bending_entries, turning_resistance = make_chain_terms(name)
     sym_mul, block_inverse = make_sym_algebra(name)
+    held_velocity, held_impulse = make_held(name, sheared)
     zero, one, two = real(0.0), real(1.0), real(2.0)
     tear, endless = real(TEAR_STRETCH), real(1.0e30)
     chi, inverse_chi, two_thirds = real(CHI), real(1.0 / CHI), real(2.0 / 3.0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False, grid_stride=False)
     def chain_step(
         offset: wp.int32,
         stages: wp.int32,
@@ -72,6 +81,10 @@ def make_chain_step(name: str):
         node_back: wp.array(dtype=vec3),
         velocity_back: wp.array(dtype=vec3),
         fiber_error: wp.array(dtype=real),
+        node_hold: wp.array(dtype=wp.uint8),
+        node_load: wp.array(dtype=vec3),
+        fiber_image: wp.array(dtype=wp.vec3i),
+        lattice: wp.array(dtype=wp.mat33d),
         status: wp.array(dtype=wp.int32),
     ):
         if status[wp.static(HALT)] != 0:
@@ -85,6 +98,9 @@ def make_chain_step(name: str):
         base = wp.abs(row_stride) * offset
         if row_stride > 0:
             base = row_stride * fiber
+        if wp.static(loaded):
+            if wp.int32(node_hold[first]) == wp.static(FROZEN):
+                return
         drag_end = g.drag * drag_diagonal(g.spacing, 0, segments)
         drag_inner = g.drag * drag_diagonal(g.spacing, 1, 2)
         drag_off = g.drag * g.coupling
@@ -194,6 +210,9 @@ def make_chain_step(name: str):
                 r = drag * e0 + drag_off * (e_before + e_after)
                 r += couple_before - couple
                 r -= kappa * (c_before - two * c_here + c_after)
+                if wp.static(loaded):
+                    if wp.int32(node_hold[i]) == wp.static(FREE):
+                        r += h * node_load[i]
 
                 # W and L
                 off = drag_off + kappa * bend[1] - rho_before
@@ -263,11 +282,20 @@ def make_chain_step(name: str):
                 yt = gap_before + wp.dot(n_before, v1)
                 v = sym_mul(pd, po, y) + yt * q
                 vt = wp.dot(q, y) + yt * s
+                if wp.static(loaded):
+                    if wp.int32(node_hold[i]) != wp.static(FREE):
+                        time, image = wp.where(from_velocity, h, dt), fiber_image[fiber]
+                        V = held_velocity(node_load[i], gradient, lattice[0], image, time)
+                        v = h * V - w0
+                        pd, po, q = nothing, nothing, nothing
+                        s = held_impulse(slack)
+                        vt = s * (yt - wp.dot(along, v))
 
                 row = Row()
                 row.diagonal = pd
                 row.off = po
                 row.q = q
+                row.s = s
                 row.l0 = l0
                 row.l1 = l1
                 row.l2 = l2

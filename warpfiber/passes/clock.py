@@ -1,19 +1,23 @@
 """Begin of a step: time, strain, the flow's gradient, the lattice and the list's deformation.
 
 Source: d(lattice)/dt = L lattice for a box whose lattice moves with the flow; exp(L dt) by its
-    series to fourth order (exact for simple shear, where L L = 0).
+    series to fourth order where L dt is small (exact for simple shear, where L L = 0).
 """
 
 from functools import cache
 
 import warp as wp
 
-from warpfiber.model import EXPIRED, HALT, STRETCHED, TORN, precision
+from warpfiber.model import EXPIRED, HALT, TORN, precision
+from warpfiber.passes.exponential import make_exponential
+
+SERIES_SIZE = 0.03  # row sum of L dt up to which the fourth order is enough
 
 
 @cache
 def make_flow_history():
     """`rate_factor(strain, schedule)` and `lattice_push(L dt)` = exp(L dt), in float64."""
+    largest_row_sum, exponential_change = make_exponential()
 
     @wp.func
     def rate_factor(strain: wp.float64, schedule: wp.array(dtype=wp.vec2d)) -> wp.float64:
@@ -30,6 +34,9 @@ def make_flow_history():
     @wp.func
     def lattice_push(x: wp.mat33d) -> wp.mat33d:
         one = wp.identity(n=3, dtype=wp.float64)
+        if largest_row_sum(x) > wp.float64(wp.static(SERIES_SIZE)):
+            change, _unused = exponential_change(x)
+            return one + change
         return one + x * (
             one
             + (x * (one + (x * (one + x * wp.float64(0.25))) * wp.float64(1.0 / 3.0)))
@@ -40,14 +47,14 @@ def make_flow_history():
 
 
 @cache
-def make_clock(name: str, sheared: bool, scheduled: bool):
+def make_clock(name: str, sheared: bool, scheduled: bool, module: str = "unique"):
     """Kernel `clock_step` (one thread)."""
     p = precision(name)
     mat33 = p.mat33
 
     rate_factor, lattice_push = make_flow_history()
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def clock_step(
         dt: wp.float64,
         rate: wp.float64,
@@ -62,8 +69,7 @@ def make_clock(name: str, sheared: bool, scheduled: bool):
         lattice_now_out: wp.array(dtype=mat33),
         deformation: wp.array(dtype=wp.mat33d),
     ):
-        stop = status[wp.static(EXPIRED)] + status[wp.static(TORN)] + status[wp.static(STRETCHED)]
-        if stop != 0:
+        if status[wp.static(EXPIRED)] + status[wp.static(TORN)] != 0:
             status[wp.static(HALT)] = 1
             return
         status[wp.static(HALT)] = 0

@@ -22,6 +22,7 @@ def elimination_row(name: str) -> Any:
         diagonal: vec3  # P
         off: vec3
         q: vec3
+        s: real
         l0: vec3  # rows of L, displacement on displacement
         l1: vec3
         l2: vec3

@@ -1,10 +1,11 @@
 """How launches run: captured once, replayed many times, by one worker or several.
 
-A step is a list of phases, a phase one launch over an index range. With one worker a whole step
-(and a batch of steps) is one graph, on CPU and CUDA alike. With more workers (CPU only) every
-worker owns one graph per phase over its part of the range, and the phases are handed over by locks:
-Warp itself runs kernels serially on the CPU. No kernel writes where another index reads, so the
-result is the same to the last bit for any number of workers.
+A step is a list of phases, a phase one launch over an index range, or phases that repeat until they
+say that they are done. With one worker a whole step (and a batch of steps) is one graph, on CPU and
+CUDA alike. With more workers (CPU only) every worker owns one graph per phase over its part of the
+range, and the phases are handed over by locks: Warp itself runs kernels serially on the CPU. No
+kernel writes where another index reads, so the result is the same to the last bit for any number of
+workers.
 
 Limits: nothing may be launched from another thread during a capture (Warp's recording is global).
 """
@@ -18,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfiber.passes.workers import Workers, wait_kernel
+from warpfiber.passes.workers import Loop, Phase, Workers, wait_kernel
 
 BATCH = 16  # steps per graph where looking after every step would cost more than it saves
 BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
@@ -82,26 +83,63 @@ class Call:
             self.function()
 
 
-class Executor:
-    """Replays the steps made of `launches`."""
+@dataclass
+class Repeat:
+    """Launches that repeat while `going[0]` (int32, on the device) is not 0.
 
-    def __init__(self, launches: Sequence[Launch | Call], device: str, workers: int = 1) -> None:
-        self.launches = [launch for launch in launches if launch.dim > 0]
+    They clear it after `most` repetitions at the latest, and do nothing once it is 0.
+    """
+
+    name: str
+    launches: list[Launch | Call]
+    going: Any
+    most: int
+
+    def run(self, device: str) -> None:
+        """Record the loop: inside the graph where the device can, else as often as it may run."""
+        launches = [launch for launch in self.launches if launch.dim > 0]
+
+        def body() -> None:
+            for launch in launches:
+                launch.run(device)
+
+        if device.startswith("cpu") or wp.is_conditional_graph_supported():
+            wp.capture_while(self.going, body)
+            return
+        for _ in range(self.most):
+            body()
+
+
+def flat(items: Iterable[Launch | Call | Repeat]) -> list[Launch | Call]:
+    """All launches with items, those that repeat among them."""
+    found: list[Launch | Call] = []
+    for item in items:
+        found += item.launches if isinstance(item, Repeat) else [item]
+    return [launch for launch in found if launch.dim > 0]
+
+
+def median(values: Sequence[float]) -> float:
+    """The middle value, 0 of none."""
+    return float(sorted(values)[len(values) // 2]) if values else 0.0
+
+
+class Executor:
+    """Replays the steps made of `items`; `launches` are all of them, repeated or not."""
+
+    def __init__(
+        self, items: Sequence[Launch | Call | Repeat], device: str, workers: int = 1
+    ) -> None:
+        self.items = [item for item in items if isinstance(item, Repeat) or item.dim > 0]
+        self.launches = flat(items)
         self.device = device
         self.workers = max(1, workers)
         # nothing may be compiled inside a capture
         load_kernels((x.kernel for x in self.launches if isinstance(x, Launch)), device)
-        items = sum(launch.dim for launch in self.launches)
-        self.batches = items < BATCH_BELOW or not device.startswith("cpu")
+        work = sum(launch.dim for launch in self.launches)
+        self.batches = work < BATCH_BELOW or not device.startswith("cpu")
         self._pool: Workers | None = None
         if self.workers > 1:
-            groups: list[list[Launch | Call]] = []
-            for launch in self.launches:
-                if launch.follows and groups:
-                    groups[-1].append(launch)
-                else:
-                    groups.append([launch])
-            phases = [self._capture_phase(group) for group in groups]
+            phases = self._capture_phases(self.items)
             load_kernels([wait_kernel()], device)
             self._pool = Workers(phases, self.workers)
         else:
@@ -111,9 +149,25 @@ class Executor:
     def _capture_steps(self, steps: int) -> Any:
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for _ in range(steps):
-                for launch in self.launches:
-                    launch.run(self.device)
+                for item in self.items:
+                    item.run(self.device)
         return capture.graph
+
+    def _capture_phases(self, items: Iterable[Launch | Call | Repeat]) -> list[Phase]:
+        groups: list[list[Launch | Call] | Repeat] = []
+        for item in items:
+            if isinstance(item, Repeat):
+                groups.append(item)
+            elif item.follows and groups and isinstance(groups[-1], list):
+                groups[-1].append(item)
+            else:
+                groups.append([item])
+        return [
+            Loop(self._capture_phases(flat([group])), group.going.numpy())
+            if isinstance(group, Repeat)
+            else self._capture_phase(group)
+            for group in groups
+        ]
 
     def _capture_phase(self, group: list[Launch | Call]) -> list[Any]:
         graphs: list[Any] = []
@@ -148,26 +202,48 @@ class Executor:
 
         The cost of replaying an empty graph is subtracted: it is not paid inside a whole step.
         """
-        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-            pass
-        graphs = [("", capture.graph)]
-        for launch in self.launches:
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                launch.run(self.device)
-            graphs.append((launch.name, capture.graph))
-        best: dict[str, list[float]] = {name: [] for name, _ in graphs}
+        idle = self._capture_apart([])
+        items = [(self._capture_apart(flat([item])), item) for item in self.items]
+        seconds: dict[str, list[float]] = {launch.name: [] for launch in self.launches}
+        rests: list[float] = []
+        replays: dict[str, list[int]] = {name: [] for name in seconds}
         for _ in range(steps):
             if halted():
                 break
-            for name, graph in graphs:
-                wp.synchronize_device(self.device)
-                begin = time.perf_counter()
-                wp.capture_launch(graph)
-                wp.synchronize_device(self.device)
-                best[name].append(time.perf_counter() - begin)
-        median = {name: sorted(t)[len(t) // 2] if t else 0.0 for name, t in best.items()}
-        idle = median.pop("")
-        return {name: max(0.0, value - idle) for name, value in median.items()}
+            rests += self._time(idle)
+            for graphs, item in items:
+                rounds = [self._time(graphs)] if isinstance(item, Launch | Call) else []
+                while isinstance(item, Repeat) and item.going.numpy()[0] != 0:
+                    rounds.append(self._time(graphs))
+                for k, launch in enumerate(flat([item])):
+                    seconds[launch.name].append(sum(times[k] for times in rounds))
+                    replays[launch.name].append(len(rounds))
+        rest = median(rests)
+        return {
+            name: max(0.0, median(times) - rest * median(replays[name]))
+            for name, times in seconds.items()
+        }
+
+    def _capture_apart(self, launches: Sequence[Launch | Call]) -> list[Any]:
+        """A graph of each launch; an empty one if there are none."""
+        graphs = []
+        for launch in launches or [None]:
+            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+                if launch is not None:
+                    launch.run(self.device)
+            graphs.append(capture.graph)
+        return graphs
+
+    def _time(self, graphs: Iterable[Any]) -> list[float]:
+        """Seconds of each graph."""
+        times = []
+        for graph in graphs:
+            wp.synchronize_device(self.device)
+            begin = time.perf_counter()
+            wp.capture_launch(graph)
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - begin)
+        return times
 
     def close(self) -> None:
         """End the extra worker threads."""

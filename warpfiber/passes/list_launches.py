@@ -92,6 +92,7 @@ def _gather(pairs: NeighborList) -> Launch:
         pairs.piece_count,
         pairs.stride,
         wp.vec3d(*pairs.model.domain.low),
+        pairs.sizes,
         pairs.state.lattice,
         pairs.order,
         pairs.piece_wrap,
@@ -105,6 +106,7 @@ def _gather(pairs: NeighborList) -> Launch:
         pairs.sorted_segment,
         pairs.sorted_wrap,
         pairs.sorted_part,
+        pairs.state.status,
     )
 
 

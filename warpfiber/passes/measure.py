@@ -55,7 +55,7 @@ class MeasureFeatures:
 
 
 @cache
-def make_measure_fibers(name: str, features: MeasureFeatures):
+def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "unique"):
     """Kernel: partial sums over fibers, columns FIBER_SUMS (+ TENSOR4) and FIBER_MAXIMA."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
@@ -124,7 +124,7 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
                         out[row, column] = out[row, column] + w * n[i] * n[j] * n[k] * n[m]
                         column += 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def measure_fibers(
         chunks: wp.int32,
         fibers: wp.int32,
@@ -207,7 +207,7 @@ def make_measure_fibers(name: str, features: MeasureFeatures):
 
 
 @cache
-def make_measure_pairs(name: str, features: PairFeatures):
+def make_measure_pairs(name: str, features: PairFeatures, module: str = "unique"):
     """Kernel: partial sums over listed pairs (PAIR_SUMS), largest overlap, which pairs touch."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -218,7 +218,7 @@ def make_measure_pairs(name: str, features: PairFeatures):
     has_repulsion = features.repulsion
     has_lubrication = features.lubrication != "none"
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def measure_pairs(
         chunks: wp.int32,
         segments: wp.int32,

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.measure import (
     FIBER_MAXIMA,
     FIBER_SUMS,
@@ -60,10 +61,21 @@ class Measurement:
         """The kernels that `row` will launch."""
         found = []
         if self.quantities & FIBER_QUANTITIES:
-            found.append(make_measure_fibers(self.model.precision.name, self._fiber_features()))
+            found.append(self._fiber_kernel())
         if pairs is not None and self.quantities & (PAIR_QUANTITIES | {"energy"}):
-            found.append(make_measure_pairs(self.model.precision.name, self.pair_features))
+            found.append(self._pair_kernel())
         return found
+
+    def _fiber_kernel(self) -> Any:
+        name = self.model.precision.name
+        return make_measure_fibers(name, self._fiber_features(), self._module())
+
+    def _pair_kernel(self) -> Any:
+        return make_measure_pairs(self.model.precision.name, self.pair_features, self._module())
+
+    def _module(self) -> str:
+        name = self.model.precision.name
+        return kernel_module("measure", name, self._fiber_features(), self.pair_features)
 
     def row(self, pairs: NeighborList | None) -> dict[str, float]:
         """All asked quantities now, in SI (overlaps in radii)."""
@@ -113,7 +125,7 @@ class Measurement:
         p, low = model.precision, np.asarray(model.domain.low)
         columns = len(FIBER_SUMS) + (len(TENSOR4) if features.orientation4 else 0)
         values, largest = self._sums(
-            make_measure_fibers(p.name, features),
+            self._fiber_kernel(),
             columns,
             len(FIBER_MAXIMA),
             model.fiber_count,
@@ -179,7 +191,7 @@ class Measurement:
     def _pair_sums(self, pairs: NeighborList, touches: Any) -> Any:
         model, state, p = self.model, self.state, self.model.precision
         return self._sums(
-            make_measure_pairs(p.name, self.pair_features),
+            self._pair_kernel(),
             len(PAIR_SUMS),
             1,
             model.segment_count,

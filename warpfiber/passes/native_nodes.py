@@ -58,7 +58,7 @@ def native_nodes_apply(model: Model, features: NodeFeatures) -> bool:
 
 
 @cache
-def make_native_node_sweep(name: str, features: NodeFeatures):
+def make_native_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
     """Kernel `native_node_sweep` over blocks of fibers."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
@@ -75,7 +75,6 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
         strength: real,
         decay: real,
         list_sizes: wp.array(dtype=real),
-        stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -100,7 +99,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
         block_own: wp.array(dtype=wp.int32),
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def native_node_sweep(
         offset: wp.int32,
         dt: real,
@@ -110,7 +109,6 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
         strength: real,
         decay: real,
         list_sizes: wp.array(dtype=real),
-        stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -144,7 +142,6 @@ def make_native_node_sweep(name: str, features: NodeFeatures):
             strength,
             decay,
             list_sizes,
-            stretch_allowed,
             groups,
             pivots,
             fiber_node_start,

@@ -11,7 +11,7 @@ import math
 
 from warpfiber.laws.bending import SMALLEST_SINE, bending_series
 from warpfiber.laws.repulsion import RANGE
-from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.native import LANES, PREFETCH_NODES, lane_types, transpose
 from warpfiber.passes.nodes import TEAR_STRETCH, NodeFeatures
 
@@ -46,7 +46,6 @@ def _constants(name: str, features: NodeFeatures) -> str:
     slots = {
         "SLOT_EXPIRED": EXPIRED,
         "SLOT_TORN": TORN,
-        "SLOT_STRETCHED": STRETCHED,
         "SLOT_HALT": HALT,
         "SLOT_BAD_FIBER": BAD_FIBER,
     }
@@ -192,7 +191,7 @@ _FORCES = """
         T(0.5) * (L[2][1] - L[1][2]), T(0.5) * (L[0][2] - L[2][0]), T(0.5) * (L[1][0] - L[0][1]));
     V3 x0 = get(x, 0), v0 = get(v, 0), n0 = same3(0, 0, 0);
     V3 f_before = same3(0, 0, 0), f_here = get(f, 0);
-    V inverse0 = V(T(0)), longest = V(T(0));
+    V inverse0 = V(T(0));
     M torn = V(T(1)) < T(0);
     for (int k = 0; k < segments; ++k) {
         const V3 x1 = get(x, k + 1), v1 = get(v, k + 1);
@@ -201,7 +200,6 @@ _FORCES = """
         const V inverse1 = T(1) / d1;
         const V3 n1 = edge * inverse1;
         torn |= ~(d1 < TEAR * g.rest);
-        longest = d1 > longest ? d1 : longest;
         const T weight = g.weight + (k == 0 ? g.weight_excess : T(0))
             + (k == segments - 1 ? g.weight_excess : T(0));
         const V3 dv = v1 - v0;
@@ -291,13 +289,9 @@ _STEP = """
     }
     if constexpr (HAS_PAIRS) {
         const M expired = furthest > (limit < T(0) ? T(-1) : limit * limit);
-        const M stretched = longest > stretch_allowed * g.rest;
-        if (any(expired | stretched))
-            for (int l = 0; l < own; ++l) {
-                if (!(keep >> l & 1)) continue;
-                if (expired[l]) status[SLOT_EXPIRED] = 1;
-                if (stretched[l]) status[SLOT_STRETCHED] = 1;
-            }
+        if (any(expired))
+            for (int l = 0; l < own; ++l)
+                if ((keep >> l & 1) && expired[l]) status[SLOT_EXPIRED] = 1;
     }
     store((T*)node_pos, x, keep);
     store((T*)node_velocity, v, keep);

@@ -92,9 +92,9 @@ for _slot, _value in {
 
 
 @cache
-def make_sort_kernels():
+def make_sort_kernels(module: str = "unique"):
     """`sort_cells`, `order_rows`, `index_partners`, each over workers, as a dict by name."""
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func_native(COUNT_KEYS + PLACE_KEYS)
     def sort_keys(

@@ -25,6 +25,7 @@ from warpfiber.model import (
     OVERFLOW_ROW,
     PAIR_COUNT,
     ROW_NEED,
+    STRETCHED,
     TORN,
     Model,
     State,
@@ -37,6 +38,7 @@ from warpfiber.passes.cells import (
     make_cell_kernels,
 )
 from warpfiber.passes.executor import Executor
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_launches import list_launches
 from warpfiber.passes.native_search import make_search_kernels
 from warpfiber.passes.native_sort import make_sort_kernels
@@ -45,8 +47,9 @@ from warpfiber.passes.pieces import piece_counts
 from warpfiber.passes.rows import make_row_kernels
 
 FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
+START_ROOM = 1.02  # for segments that are longer than that from the start
 FARTHEST = 1e8  # lengths from the origin, where single precision no longer tells neighbors
-CELL_SLACK = 1.02  # what a segment may grow in the step that outgrows the cells
+STRETCH_GROWTH = 1.2  # of the allowed stretch, when a segment outgrew the cells
 OPEN_FRACTION = 0.1  # volume fraction that long segments are cut for where there is no box
 
 
@@ -75,7 +78,7 @@ class NeighborList:
         self.model, self.state = model, state
         self.reach, self.skin = reach, skin
         self.longest_rest = longest_rest
-        self.stretch_allowed = max(FIRST_STRETCH, CELL_SLACK * stretch)
+        self.stretch_allowed = max(FIRST_STRETCH, START_ROOM * stretch)
         self.row_capacity = row_capacity
         self.pair_capacity = pair_capacity or max(64, 3 * model.segment_count // 2)
         self.workers = workers
@@ -87,12 +90,13 @@ class NeighborList:
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
         features = ListFeatures(domain.periodic, domain.shear_axes, domain.sheared, has_pieces)
-        self.kernels = dict(make_cell_kernels(name, features, self.native))  # cached: copy
         if self.native:
-            self.kernels |= make_search_kernels(name, domain.periodic, has_pieces)
-            self.kernels |= make_sort_kernels()
+            module = kernel_module("list", name, features)
+            self.kernels = make_cell_kernels(name, features, True, module)
+            self.kernels |= make_search_kernels(name, domain.periodic, has_pieces, module)
+            self.kernels |= make_sort_kernels(module)
         else:
-            self.kernels |= make_row_kernels(name, features)
+            self.kernels = make_cell_kernels(name, features) | make_row_kernels(name, features)
         self._allocate_cells()
         self._allocate_rows()
         self._allocate_pairs()
@@ -132,11 +136,8 @@ class NeighborList:
 
     @property
     def cell_width(self) -> float:
-        """Width that holds a segment, its reach and the skin; a step may stretch a bit more."""
-        return self._stretched(self.longest_rest) + self.reach + self.skin
-
-    def _stretched(self, length: float) -> float:
-        return CELL_SLACK * self.stretch_allowed * length
+        """Width that holds a segment, its reach and the skin."""
+        return self.stretch_allowed * self.longest_rest + self.reach + self.skin
 
     def set_stretch(self, stretch: float) -> None:
         """Cells that hold segments of this many rest lengths, from the next build on."""
@@ -150,7 +151,7 @@ class NeighborList:
 
     def _write_sizes(self) -> None:
         extent = self.reach + self.skin
-        self.sizes.assign(np.asarray([extent, self._stretched(self.longest_piece)]))
+        self.sizes.assign(np.asarray([extent, self.stretch_allowed * self.longest_piece]))
         self.skin_out.assign(np.asarray([extent, self.skin], dtype=self.model.precision.numpy))
 
     # -- arrays -----------------------------------------------------------------------------------
@@ -242,7 +243,11 @@ class NeighborList:
     # -- building ---------------------------------------------------------------------------------
 
     def build(self, *, wrap: bool = True) -> bool:
-        """Build from the current positions; True if pair arrays were replaced by larger ones."""
+        """Build from the current positions; True if pair arrays were replaced by larger ones.
+
+        A segment longer than the cells hold widens them (`stretch_allowed`) before anything uses
+        the list.
+        """
         replaced = False
         while True:
             if self._wraps != int(wrap):
@@ -252,11 +257,11 @@ class NeighborList:
                 self._executor = Executor(list_launches(self), self.model.device, self.workers)
             self._executor.run(1, _never)
             status = self.state.status.numpy()
-            overflow = int(status[OVERFLOW])
-            if overflow == 0:
-                self.build_count += 1
+            overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])
+            lost = self._lost_fiber() if overflow or stretched else None
+            if overflow == 0 and (not stretched or lost is not None):
+                self.build_count += 1  # a torn fiber is reported by the next step
                 return replaced
-            lost = self._lost_fiber()
             if lost is not None:
                 words = status.copy()
                 words[TORN], words[BAD_FIBER], words[OVERFLOW] = 1, lost, 0
@@ -264,6 +269,9 @@ class NeighborList:
                 return replaced
             self.grow_count += 1
             wrap = False  # fibers are inside the box by now
+            if stretched:
+                self.set_stretch(STRETCH_GROWTH * self.stretch_allowed)
+                continue
             need = int(status[ROW_NEED])
             if overflow == OVERFLOW_ROW:
                 self.row_capacity = max(int(1.5 * need), self.row_capacity + 1)

@@ -20,7 +20,7 @@ from warpfiber.laws.flow import make_flow
 from warpfiber.laws.stretching import make_stretching
 from warpfiber.laws.torque import make_torque
 from warpfiber.laws.wall import make_wall
-from warpfiber.model import BAD_FIBER, EXPIRED, HALT, STRETCHED, TORN, precision
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN, precision
 from warpfiber.passes.precision import group_struct
 
 # A segment longer than this many rest lengths is no longer a physical state but a diverging step.
@@ -38,7 +38,7 @@ class NodeFeatures:
 
 
 @cache
-def make_node_sweep(name: str, features: NodeFeatures):
+def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
     """Kernel `node_sweep` in the given precision with the given features."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
@@ -135,7 +135,7 @@ def make_node_sweep(name: str, features: NodeFeatures):
             stretch = wp.max(stretch, norm)
         return half * (skin - stretch * list_reach)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def node_sweep(
         offset: wp.int32,
         dt: real,
@@ -145,7 +145,6 @@ def make_node_sweep(name: str, features: NodeFeatures):
         strength: real,
         decay: real,
         list_sizes: wp.array(dtype=real),
-        stretch_allowed: real,
         groups: wp.array(dtype=Group),
         pivots: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -345,7 +344,5 @@ def make_node_sweep(name: str, features: NodeFeatures):
         if wp.static(has_pairs):
             if limit < zero or furthest > limit * limit:
                 status[wp.static(EXPIRED)] = 1
-            if longest > stretch_allowed * g.rest:
-                status[wp.static(STRETCHED)] = 1
 
     return node_sweep

@@ -1,8 +1,9 @@
 """One sweep over listed pairs: capsule repulsion and bead lubrication between two segments.
 
-One thread owns a segment and its outgoing pairs (on the CPU `native_pairs` has blocks of pairs
-instead). It stores per pair whether it acts and, only then, the force on the owner and where it
-acts (a slot that does not act keeps stale values); the node sweep gathers, so nothing is added
+One thread owns a pair (on the CPU `native_pairs` has blocks of pairs instead): 27 ns per segment in
+float64 and 24 in float32 where one thread per segment, whose pairs are none, one or several, took
+31 and 29. It stores whether the pair acts and, only then, the force on the owner and where it acts
+(a slot that does not act keeps stale values); the node sweep gathers, so nothing is added
 atomically and the result does not depend on the number of workers. `closest`: force and the
 fractions (s, t) of the one point pair. `arms`: several bead pairs act, so the sums of s F and t F
 are stored instead.
@@ -19,7 +20,7 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE, make_repulsion
 from warpfiber.laws.segment_distance import make_segment_distance
-from warpfiber.model import HALT, precision
+from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.bead_pairs import make_bead_pairs
 from warpfiber.passes.precision import group_struct
 
@@ -236,7 +237,7 @@ def make_pair_law(name: str, features: PairFeatures, is_squeezed: bool = False):
 
 @cache
 def make_pair_sweep(name: str, features: PairFeatures):
-    """Kernel `pair_sweep` in the given precision with the given features, over segments."""
+    """Kernel `pair_sweep` in the given precision with the given features, over all places."""
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
@@ -257,7 +258,7 @@ def make_pair_sweep(name: str, features: PairFeatures):
         segment_fiber: wp.array(dtype=wp.int32),
         gradient: wp.array(dtype=mat33),
         lattice: wp.array(dtype=mat33),
-        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
@@ -271,52 +272,50 @@ def make_pair_sweep(name: str, features: PairFeatures):
     ):
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
-        begin = out_start[i]
-        end = out_start[i + 1]
-        if begin == end:
+        k = wp.tid() + offset
+        if k >= status[wp.static(PAIR_COUNT)]:
             return
+        i = pair_i[k]
         node_i = segment_node[i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
-        for k in range(begin, end):
-            j = pair_j[k]
-            node_j = segment_node[j]
-            xj = node_pos[node_j]
-            b = node_pos[node_j + 1] - xj
-            shift = image_shift(pair_image[k], lattice[0])
-            delta = xj - xi + shift
-            st = closest_fractions(delta, a, b)
-            # most listed pairs end here, before anything is read of their fibers
-            if not (wp.length_sq(delta + st[1] * b - st[0] * a) <= reach_bound * reach_bound):
-                pair_acts_out[k] = wp.uint8(0)
-                continue
-            apply_pair_law(
-                k,
-                i,
-                j,
-                node_i,
-                node_j,
-                a,
-                b,
-                delta,
-                shift,
-                st,
-                dt,
-                strength,
-                decay,
-                groups,
-                fiber_node_start,
-                fiber_group,
-                segment_fiber,
-                gradient,
-                node_pos,
-                node_velocity,
-                pair_acts_out,
-                pair_force_out,
-                pair_closest_out,
-                pair_arm_i_out,
-                pair_arm_j_out,
-            )
+        j = pair_j[k]
+        node_j = segment_node[j]
+        xj = node_pos[node_j]
+        b = node_pos[node_j + 1] - xj
+        shift = image_shift(pair_image[k], lattice[0])
+        delta = xj - xi + shift
+        st = closest_fractions(delta, a, b)
+        # most listed pairs end here, before anything is read of their fibers
+        if not (wp.length_sq(delta + st[1] * b - st[0] * a) <= reach_bound * reach_bound):
+            pair_acts_out[k] = wp.uint8(0)
+            return
+        apply_pair_law(
+            k,
+            i,
+            j,
+            node_i,
+            node_j,
+            a,
+            b,
+            delta,
+            shift,
+            st,
+            dt,
+            strength,
+            decay,
+            groups,
+            fiber_node_start,
+            fiber_group,
+            segment_fiber,
+            gradient,
+            node_pos,
+            node_velocity,
+            pair_acts_out,
+            pair_force_out,
+            pair_closest_out,
+            pair_arm_i_out,
+            pair_arm_j_out,
+        )
 
     return pair_sweep

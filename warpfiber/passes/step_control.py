@@ -1,5 +1,9 @@
 """Begin and end of an implicit step: the flow at its stages, acceptance, time, size of the next.
 
+A step that fails (error above the tolerance, contact that was not kept apart) is taken back and
+repeated by half; one that the neighbor list or the rows of contact cannot hold is taken back as it
+is, and the host enlarges them.
+
 Source: stage strains by the midpoint rule of d(strain)/dt = rate f(strain); the lattice follows the
     gradient of the middle of the step. Step sizes: accept an error up to 1.5 tolerances, then dt
     times clip(0.85 sqrt(tol / error), 0.3, 2); after a rejection max(0.2, 0.8 sqrt(tol / error)).
@@ -12,19 +16,23 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.model import BAD_FIBER, HALT, TORN, precision
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN, precision
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.clock import make_flow_history
 
 ERROR_CHUNKS = 64
+KEEP, HALVE, AGAIN = range(3)  # verdicts on a step
 SMALLEST_SHARE = 1e-9  # of the largest step: below it a fiber that is still rejected is torn
 
 
 @cache
-def make_step_begin(name: str):
-    """Kernel `step_begin` (one thread): gradients of both stages; halts after a tear."""
+def make_step_begin(name: str, sheared: bool = False):
+    """Kernel `step_begin` (one thread): what the step is made with; halts until the host looked.
+
+    Gradients of both stages; lattice at start and end; deformation of the list's end.
+    """
     mat33 = precision(name).mat33
-    rate_factor, _ = make_flow_history()
+    rate_factor, lattice_push = make_flow_history()
 
     @wp.func
     def strain_after(
@@ -44,11 +52,17 @@ def make_step_begin(name: str):
         schedule: wp.array(dtype=wp.vec2d),
         step_size: wp.array(dtype=wp.float64),
         strain: wp.array(dtype=wp.float64),
+        lattice: wp.array(dtype=wp.mat33d),
+        deformation: wp.array(dtype=wp.mat33d),
         status: wp.array(dtype=wp.int32),
+        rejected_out: wp.array(dtype=wp.int32),
         strain_next_out: wp.array(dtype=wp.float64),
         stage_gradient_out: wp.array(dtype=mat33),
+        ends_lattice_out: wp.array(dtype=mat33),
+        deformation_next_out: wp.array(dtype=wp.mat33d),
     ):
-        if status[wp.static(TORN)] != 0:
+        rejected_out[0] = 0
+        if status[wp.static(TORN)] + status[wp.static(EXPIRED)] != 0:
             status[wp.static(HALT)] = 1
             return
         status[wp.static(HALT)] = 0
@@ -58,6 +72,13 @@ def make_step_begin(name: str):
         stage_gradient_out[0] = mat33(rate_factor(first, schedule) * full_gradient)
         stage_gradient_out[1] = mat33(rate_factor(last, schedule) * full_gradient)
         strain_next_out[0] = last
+        middle = rate_factor(wp.float64(0.5) * (strain[0] + last), schedule)
+        push = lattice_push((dt * middle) * full_gradient)
+        deformation_next_out[0] = push * deformation[0]
+        ends_lattice_out[0] = mat33(lattice[0])
+        ends_lattice_out[1] = mat33(lattice[0])
+        if wp.static(sheared):
+            ends_lattice_out[1] = mat33(push * lattice[0])
 
     return step_begin
 
@@ -92,8 +113,12 @@ def make_largest_error(name: str):
 
 
 @cache
-def make_step_end(name: str, sheared: bool, adaptive: bool):
-    """Kernel `step_end` (one thread): accept or not, advance the time, choose the next step."""
+def make_step_end(name: str, sheared: bool, adaptive: bool, judged: bool = False):
+    """Kernel `step_end` (one thread): accept or not, advance the time, choose the next step.
+
+    `judged`: a verdict on the contacts of the step may ask for half of it (1) or for the same again
+    after the host has enlarged something (2).
+    """
     mat33 = precision(name).mat33
     rate_factor, lattice_push = make_flow_history()
 
@@ -105,6 +130,7 @@ def make_step_end(name: str, sheared: bool, adaptive: bool):
         largest_step: wp.float64,
         error: wp.array(dtype=wp.float64),
         error_fiber: wp.array(dtype=wp.int32),
+        verdict: wp.array(dtype=wp.int32),
         strain_next: wp.array(dtype=wp.float64),
         step_size: wp.array(dtype=wp.float64),
         rejected_out: wp.array(dtype=wp.int32),
@@ -120,6 +146,19 @@ def make_step_end(name: str, sheared: bool, adaptive: bool):
         if status[wp.static(HALT)] != 0:
             return
         dt = step_size[0]
+        if wp.static(judged):
+            if verdict[0] != 0:
+                rejected_out[0] = 1
+                if verdict[0] == wp.static(AGAIN):
+                    status[wp.static(EXPIRED)] = 1
+                    return
+                rejected_out[1] = rejected_out[1] + 1
+                step_size[0] = wp.float64(0.5) * dt
+                if step_size[0] < wp.float64(wp.static(SMALLEST_SHARE)) * largest_step:
+                    status[wp.static(TORN)] = 1
+                    status[wp.static(BAD_FIBER)] = verdict[1]
+                return
+            step_size[0] = wp.min(wp.float64(2.0) * dt, largest_step)
         if wp.static(adaptive):
             largest = wp.float64(0.0)
             worst = wp.int32(0)
@@ -130,7 +169,6 @@ def make_step_end(name: str, sheared: bool, adaptive: bool):
             ratio = wp.float64(1.0e3)
             if largest > wp.float64(1.0e-6) * tolerance:
                 ratio = wp.sqrt(tolerance / largest)
-            rejected_out[0] = 0
             factor = wp.clamp(wp.float64(0.85) * ratio, wp.float64(0.3), wp.float64(2.0))
             if not (largest <= wp.float64(1.5) * tolerance):
                 rejected_out[0] = 1
@@ -159,8 +197,11 @@ def make_step_end(name: str, sheared: bool, adaptive: bool):
 
 
 @cache
-def make_take_back(name: str):
-    """Kernel `take_back`: every fiber as before a rejected step, one thread per fiber."""
+def make_take_back(name: str, tense: bool = True):
+    """Kernel `take_back`: every fiber as before a rejected step, one thread per fiber.
+
+    `tense`: segments carry a tension from step to step.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
 
@@ -175,16 +216,16 @@ def make_take_back(name: str):
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         tension: wp.array(dtype=real),
-        status: wp.array(dtype=wp.int32),
     ):
-        if status[wp.static(HALT)] != 0 or rejected[0] == 0:
+        if rejected[0] == 0:
             return
         fiber = wp.tid() + offset
         last = fiber_node_start[fiber + 1] - 1
         for i in range(fiber_node_start[fiber], last + 1):
             node_pos[i] = node_back[i]
             node_velocity[i] = velocity_back[i]
-            if i < last:
-                tension[i - fiber] = tension_back[i - fiber]
+            if wp.static(tense):
+                if i < last:
+                    tension[i - fiber] = tension_back[i - fiber]
 
     return take_back

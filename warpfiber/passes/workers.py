@@ -1,17 +1,18 @@
 """Threads that replay graphs side by side on the CPU, and how they hand over to one another.
 
-A phase is one graph per worker. Locks decide who may go on; because waking a sleeping thread takes
-longer than many a phase, a thread that waits first looks at a ticket for some microseconds in a
-native loop, which leaves the interpreter to the others. The ticket only says when to look at the
-lock; it decides nothing.
+A phase is one graph per worker, or a loop of phases while a word says so. Locks decide who may go
+on; because waking a sleeping thread takes longer than many a phase, a thread that waits first looks
+at a ticket for some microseconds in a native loop, which leaves the interpreter to the others. The
+ticket only says when to look at the lock; it decides nothing.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import warp as wp
 
@@ -75,13 +76,22 @@ class _Gate:
         self.seen[self.slot] += 1
 
 
+@dataclass
+class Loop:
+    """Phases that repeat while `going[0]` is not 0."""
+
+    phases: list[Phase]
+    going: Any  # int32, view of what the phases write
+
+
+# The graph of every worker, or None where it has nothing to do.
+Phase: TypeAlias = "list[Any] | Loop"
+
+
 class Workers:
-    """Persistent threads that replay their graph of a phase when told to; the caller is worker 0.
+    """Threads that replay their graph of a phase when told to; the caller is worker 0."""
 
-    phases: per phase the graph of every worker, or None.
-    """
-
-    def __init__(self, phases: list[list[Any]], workers: int) -> None:
+    def __init__(self, phases: list[Phase], workers: int) -> None:
         self.phases = phases
         self.phase: list[Any] | None = None
         tickets = wp.zeros(2 * LINE * workers, dtype=wp.int32, device="cpu")
@@ -111,17 +121,24 @@ class Workers:
         for _ in range(steps):
             if halted():
                 return
-            for phase in self.phases:
-                if all(graph is None for graph in phase[1:]):
-                    wp.capture_launch(phase[0])
-                    continue
-                self.phase = phase
-                for gate in self.go:
-                    gate.open()
-                if phase[0] is not None:  # fewer items than workers: the last ones have them
-                    wp.capture_launch(phase[0])
-                for gate in self.done:
-                    gate.wait()
+            self._replay(self.phases)
+
+    def _replay(self, phases: list[Phase]) -> None:
+        for phase in phases:
+            if isinstance(phase, Loop):
+                while phase.going[0] != 0:
+                    self._replay(phase.phases)
+                continue
+            if all(graph is None for graph in phase[1:]):
+                wp.capture_launch(phase[0])
+                continue
+            self.phase = phase
+            for gate in self.go:
+                gate.open()
+            if phase[0] is not None:  # fewer items than workers: the last ones have them
+                wp.capture_launch(phase[0])
+            for gate in self.done:
+                gate.wait()
 
     def close(self) -> None:
         """End the threads."""

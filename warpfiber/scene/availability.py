@@ -19,18 +19,12 @@ class Row:
     advice: str
 
 
-METHOD_ADVICE = 'use method = "bead_chain", "overdamped", or "bonded_spheres"'
-FIBER_ADVICE = "give several [[fibers]] groups instead"
 STAGE_ADVICE = 'only kind = "flow" and "settle" run; end it by end_strain, end_time or end_speed'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("fibers", "layers", (), FIBER_ADVICE),
-    Row("fibers", "length_distribution", (), FIBER_ADVICE),
-    Row("fibers", "frozen", (False,), "remove it; all fibers move"),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
-    Row("contact", "law", ("none", "exponential", "hertz"), 'use "exponential", "hertz" or "none"'),
     Row("stage", "kind", ("flow", "settle"), STAGE_ADVICE),
     Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
     Row("stage", "end_pressure", (), STAGE_ADVICE),
@@ -41,8 +35,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
-    Row("numerics", "method", ("bead_chain", "overdamped", "bonded_spheres"), METHOD_ADVICE),
-    Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
@@ -53,30 +45,35 @@ FLOWING = (
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
-    Row("load", "", (), "remove the table; its loads are of method bonded_spheres"),
 )
-ALONE_ADVICE = 'fibers of overdamped do not meet; use "none", or method = "bead_chain"'
+SOFT = Row("contact", "law", ("none", "exponential", "linear"),
+           'use law = "exponential", "linear" or "none"')  # fmt: skip
 
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         *FLOWING,
-        Row("contact", "law", ("none", "exponential"),
-            'use "exponential"; "hertz" is of method bonded_spheres'),
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
+        Row("contact", "law", ("none", "exponential"),
+            'use law = "exponential", or method = "overdamped"'),
+        Row("numerics", "contact", ("penalty",),
+            'use contact = "penalty", or method = "overdamped"'),
     ),
     "overdamped": (
         *FLOWING,
-        Row("contact", "law", ("none",), ALONE_ADVICE),
-        Row("contact", "lubrication", ("none",), ALONE_ADVICE),
-        Row("box", "boundary", ("periodic", "open"),
-            'walls of overdamped do not push; use "periodic" or "open", or method = "bead_chain"'),
+        SOFT,
+        Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
+    ),
+    "rigid_rod": (
+        *FLOWING,
+        SOFT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (
         Row("stage", "kind", ("settle",), 'there is no fluid; use kind = "settle"'),
         Row("contact", "law", ("none", "hertz"), 'use law = "hertz", or "none"'),
         Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
+        Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
         Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
     ),
 }  # fmt: skip

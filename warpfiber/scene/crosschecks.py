@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 
 from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
-from warpfiber.scene.derived import reach
+from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
+from warpfiber.scene.loads import check_loads
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
-DRAGGED = ("bead_chain", "overdamped")
+DRAGGED = ("bead_chain", *INERTIALESS)
 """Methods without another cause of motion than a fluid."""
 HOPELESS_FRACTION = 0.9
 """Volume fraction that no packing of straight fibers reaches: touching parallel cylinders fill
@@ -42,6 +43,7 @@ def cross_check(draft: Draft) -> None:
     _check_contact(draft)
     _check_stages(draft)
     _check_rest(draft)
+    check_loads(draft)
 
 
 def _check_tables(draft: Draft) -> None:
@@ -63,12 +65,7 @@ def _check_method(draft: Draft) -> None:
     """What the method cannot run, defaults included, and what its step and weight need."""
     for row in NOT_IN_METHOD.get(draft.method or "", ()):
         tables: dict[str, Values | None]
-        if not row.key:
-            remedy = unavailable_in(draft.method, row.table, "", None)
-            if draft.is_given(row.table) and remedy is not None:
-                draft.faults.add(row.table, None, remedy)
-            continue
-        many = {"fibers": draft.fibers, "stage": draft.stages, "load": draft.loads}
+        many = {"fibers": draft.fibers, "stage": draft.stages}
         if row.table in many:
             tables = {f"{row.table}.{i}": table for i, table in enumerate(many[row.table])}
         else:
@@ -82,8 +79,10 @@ def _check_method(draft: Draft) -> None:
                 draft.faults.add(key, value, remedy if given else f"the default is {remedy}")
     if draft.method == "bonded_spheres":
         _check_bonded_spheres(draft)
-    if draft.method != "overdamped":
+    if draft.method not in INERTIALESS:
         return
+    if draft.method == "rigid_rod":
+        _check_rods(draft)
     if draft.numerics["tolerance"] is not None:
         if draft.numerics["integrator"] == "bdf2":
             remedy = 'bdf2 takes steps of one size; use integrator = "sdirk2", or dt'
@@ -92,15 +91,26 @@ def _check_method(draft: Draft) -> None:
             draft.blame("numerics.tolerance", "the flow has no rate; give dt in s instead")
     for index, group in enumerate(draft.fibers):
         if draft.is_given(f"fibers.{index}.initial_velocity"):
-            draft.note(f"fibers.{index}.initial_velocity has no effect in method overdamped")
-        if draft.gravity is not None and group["density"] is None:
+            draft.note(f"fibers.{index}.initial_velocity has no effect in method {draft.method}")
+        if draft.gravity is not None and group["density"] is None and not group["frozen"]:
             draft.faults.add(
                 f"fibers.{index}.density", None, "missing; [gravity] needs it in kg/m3"
             )
 
 
+def _check_rods(draft: Draft) -> None:
+    """A rod has one segment and keeps its length."""
+    place = draft.given("numerics", SEGMENT_KEYS)
+    if any((group["segments"] or 1) != 1 for group in draft.fibers):
+        remedy = 'a rod is one segment; remove it, or use method = "overdamped" or "auto"'
+        draft.blame(place, remedy)
+    for index in range(len(draft.fibers)):
+        if draft.is_given(f"fibers.{index}.inextensible"):
+            draft.note(f"fibers.{index}.inextensible has no effect: rods keep their length")
+
+
 def _check_bonded_spheres(draft: Draft) -> None:
-    """No fluid; elastic constants that hold together; loads on nodes that there are."""
+    """No fluid; elastic constants that hold together; rows of stages of unknown length."""
     if draft.is_given("flow"):
         draft.faults.add("flow", None, "bonded_spheres has no fluid; remove the table")
     if draft.numerics["strain_step"] is not None:
@@ -118,26 +128,6 @@ def _check_bonded_spheres(draft: Draft) -> None:
                 f"stage.{index}: rows and frames are spread over time_limit = {limit} s (default); "
                 "give a nearer one for more of them"
             )
-    for index, load in enumerate(draft.loads):
-        _check_load(draft, load, f"load.{index}")
-
-
-def _check_load(draft: Draft, load: Values, path: str) -> None:
-    """A load has a group, a fiber and a node; a force where it is free, a velocity where held."""
-    groups = draft.fibers
-    if load["group"] is None or not -len(groups) <= load["group"] < len(groups):
-        draft.blame(f"{path}.group", f"there are {len(groups)} [[fibers]]; count from 0")
-        return
-    group = groups[load["group"]]
-    sizes = {"fiber": group["count"], "node": (group["segments"] or 0) + 1}
-    for key, size in sizes.items():
-        if load[key] is None or not size or group["node_file"] is not None:
-            continue
-        if not -size <= load[key] < size:
-            draft.blame(f"{path}.{key}", f"the group has {size}; count from 0, or back from -1")
-    unused = "velocity" if load["hold"] == "free" else "force"
-    if load[unused] is not None:
-        draft.blame(f"{path}.{unused}", f'has no effect with hold = "{load["hold"]}"; remove it')
 
 
 def _check_flow(draft: Draft) -> None:
@@ -259,7 +249,10 @@ def _check_positions(draft: Draft, group: Values, path: str) -> None:
 
 def _check_filling(draft: Draft) -> None:
     """All groups together fill less of the box than the densest packing of cylinders."""
-    shares = [group["volume_fraction_achieved"] or 0.0 for group in draft.fibers]
+    shares = [
+        group["volume_fraction_achieved"] or group["volume_fraction"] or 0.0
+        for group in draft.fibers
+    ]
     total = math.fsum(shares)
     if total >= HOPELESS_FRACTION:
         fullest = shares.index(max(shares))
@@ -273,6 +266,16 @@ def _check_contact(draft: Draft) -> None:
     if draft.contact["law"] == "none" and draft.contact["lubrication"] in ("paper", "shifted"):
         remedy = 'law = "none" switches off all pairs; remove it, or use law = "exponential"'
         draft.blame("contact.lubrication", remedy)
+    if draft.contact["law"] == "linear" and draft.contact["stiffness"] is None:
+        draft.faults.add("contact.stiffness", None, 'missing; law = "linear" needs it in N/m')
+    if draft.method not in INERTIALESS:
+        return
+    if draft.contact["law"] == "none" and draft.axes("wall"):
+        remedy = 'walls push by contact; use law = "exponential", or no wall in box.boundary'
+        draft.blame("contact.law", remedy)
+    if draft.contact["law"] != "none" and draft.numerics["integrator"] == "bdf2":
+        remedy = 'contact needs a method of one step; use "sdirk2", or contact.law = "none"'
+        draft.blame("numerics.integrator", remedy)
 
 
 def _check_stages(draft: Draft) -> None:

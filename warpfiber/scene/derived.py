@@ -14,6 +14,8 @@ import math
 from warpfiber.scene.scene import Scene
 from warpfiber.scene.tables import FiberGroup
 
+INERTIALESS = ("overdamped", "rigid_rod")
+"""Methods whose fibers have no mass."""
 REPULSION_REACH = 2.001
 """Center line distance in radii below which fibers repel (Sasayama & Inagaki 2018, appendix A)."""
 LUBRICATION_REACH = 3.0
@@ -25,7 +27,12 @@ def effective_stiffness(scene: Scene, group: FiberGroup) -> float | None:
     if scene.flow is None or scene.flow.rate == 0.0 or group.aspect_ratio == 0.0:
         return None
     stress = scene.flow.viscosity * scene.flow.rate
-    return math.pi * group.bending_modulus / (64.0 * stress * group.aspect_ratio**4)
+    return bending_stiffness(group.bending_modulus, group.aspect_ratio, stress)
+
+
+def bending_stiffness(modulus: float, aspect_ratio: float, stress: float) -> float:
+    """S_eff of a bending modulus against the stress eta rate, both in Pa."""
+    return math.pi * modulus / (64.0 * stress * aspect_ratio**4)
 
 
 def reynolds_number(scene: Scene, group: FiberGroup) -> float | None:

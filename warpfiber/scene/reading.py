@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from warpfiber.scene.availability import unavailable
+from warpfiber.scene.choice import choose_method, is_auto, with_method
 from warpfiber.scene.crosschecks import cross_check
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import Fault, FaultList, SceneError, nearest
 from warpfiber.scene.keys import Reader, Table, Values, dotted, read_table
 from warpfiber.scene.overrides import COMMAND, apply_overrides
 from warpfiber.scene.resolving import resolve
-from warpfiber.scene.scene import Numerics, Record, Scene, Stage, scene_from_resolved
+from warpfiber.scene.scene import Numerics, Record, RodTrial, Scene, Stage, scene_from_resolved
 from warpfiber.scene.schema import (
     BOX,
     CONTACT,
@@ -115,11 +116,27 @@ def _scene(
     """Return the checked scene of raw tables."""
     tables, faults = apply_overrides(_mended(raw), overrides, path)
     _check_headings({**tables, **raw}, faults)
+    reason, rods = None, None
+    if is_auto(tables):
+
+        def read(method: str) -> Draft:
+            return _checked(with_method(tables, method), FaultList(path), folder)
+
+        method, reason, trial = choose_method(read)
+        if trial is not None:
+            rods = RodTrial(_finished(read("rigid_rod"), path, reason), trial)
+        tables = with_method(tables, method)
+    draft = _checked(tables, faults, folder)
+    faults.raise_if_any()
+    return _finished(draft, path, reason, rods)
+
+
+def _checked(tables: dict[str, Any], faults: FaultList, folder: Path) -> Draft:
+    """Read, complete and check the tables."""
     draft = _draft(tables, faults, folder)
     resolve(draft)
     cross_check(draft)
-    faults.raise_if_any()
-    return _finished(draft, path)
+    return draft
 
 
 def _draft(raw: dict[str, Any], faults: FaultList, folder: Path) -> Draft:
@@ -219,7 +236,9 @@ def _check_available(reader: Reader, table: Table, path: str, raw: Mapping[str, 
         reader.faults.add(path, None, remedy)
 
 
-def _finished(draft: Draft, path: str) -> Scene:
+def _finished(
+    draft: Draft, path: str, method_reason: str | None, rods: RodTrial | None = None
+) -> Scene:
     """Return the scene of a draft without faults."""
     assert draft.flow is None or draft.flow_object is not None
     return Scene(
@@ -239,6 +258,8 @@ def _finished(draft: Draft, path: str) -> Scene:
         numerics=_made(Numerics, draft.numerics),
         path=path,
         notes=tuple(draft.faults.notes),
+        method_reason=method_reason,
+        rod_trial=rods,
     )
 
 

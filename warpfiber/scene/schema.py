@@ -7,6 +7,7 @@ Defaults that depend on other tables are resolved in `resolving.py`, rules betwe
 
 from __future__ import annotations
 
+from warpfiber.scene.derived import INERTIALESS
 from warpfiber.scene.keys import Inline, Key, OneOf, Table
 from warpfiber.scene.kinds import (
     Choice,
@@ -138,6 +139,7 @@ FIBERS = Table(
         Key("count", COUNT),
         Key("volume_fraction", FRACTION),
         Key("layers", Either((Inline(LAYER, many=True), CSV_FILE))),
+        Key("layer_mode", Choice(("span", "inside"))),
         Key("aspect_ratio", Number(above=1, below=1e6)),
         Key("length", LENGTH),
         Key("centerline_length", LENGTH),
@@ -314,13 +316,13 @@ NUMERICS = Table(
             "closure",
             Choice(("none", "paper", "consistent")),
             default="consistent",
-            methods=("bead_chain", "overdamped"),
+            methods=("bead_chain", *INERTIALESS),
         ),
         Key(
             "torque_weights",
             Choice(("end_weighted", "plain")),
             default="end_weighted",
-            methods=("bead_chain", "overdamped"),
+            methods=("bead_chain", *INERTIALESS),
         ),
         Key(
             "integrator",
@@ -334,6 +336,8 @@ NUMERICS = Table(
             default="penalty",
             method_default=(("overdamped", "unilateral"), ("rigid_rod", "unilateral")),
         ),
+        Key("contact_tolerance", Number(above=0), default=1e-3, methods=INERTIALESS),
+        Key("linearizations", Number(least=1, below=3, whole=True), default=1, methods=INERTIALESS),
         Key("dt", Either((Number("s", above=0), AUTO))),
         Key("strain_step", Number(above=0)),
         Key("tolerance", Number(above=0), methods=("overdamped",)),

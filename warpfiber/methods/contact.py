@@ -1,0 +1,218 @@
+"""Contact inside an implicit step: fibers that do not meet, or penalties taken at its end.
+
+Between the motion without contact and the end of the step: does the list hold every pair that may
+meet, rows at the start of the step, their forces, the motion that these cause, and a look at the
+result. With two linearizations, rows of the result push once more against what is left.
+Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
+    result overlaps by more than OVERLAP or in which center lines passed each other is halved.
+Limits: first order in dt; frictionless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warpfiber.laws.lubrication import OUTER
+from warpfiber.methods.pair_search import PairSearch
+from warpfiber.model import EXPIRED, HALT, Model, State
+from warpfiber.passes.contact_check import ContactCheck
+from warpfiber.passes.contact_rows import KEEP, ContactRows
+from warpfiber.passes.contact_verdict import make_contact_verdict
+from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
+from warpfiber.scene import Scene
+
+OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
+FINITE = 1e20  # radii; penalties may overlap
+Launches = list[Launch | Call | Repeat]
+
+
+@dataclass
+class StepArrays:
+    """What a step that may be taken back works with, on the device."""
+
+    node_back: Any  # (N,) vec3 positions at the start
+    ends_lattice: Any  # (2,) mat33 lattice at start and end
+    deformation_next: Any  # (1,) mat33d deformation of the list at the end
+    step_size: Any  # (1,) float64
+    rejected: Any  # (2,) int32: the step under way, and in all
+    verdict: Any  # (2,) int32: verdict of the contacts, fiber that it is about
+
+
+class MovingResponse(Response, Protocol):
+    """A response that also moves the fibers by the solution."""
+
+    def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
+        """`carried`: share of the velocity of contact that the fibers take on."""
+
+
+def has_contact(scene: Scene) -> bool:
+    """Whether fibers meet one another or a wall."""
+    return scene.contact.law != "none" or scene.contact.lubrication != "none"
+
+
+def contact_law(scene: Scene, model: Model) -> ContactLaw:
+    """The law of contacts in run units."""
+    contact, units = scene.contact, model.units
+    if scene.numerics.contact == "unilateral":
+        return ContactLaw()
+    if contact.law == "linear":
+        stiffness = (contact.stiffness or 0.0) * units.length / units.force
+        return ContactLaw("linear", stiffness)
+    return ContactLaw("exponential", (contact.strength or 0.0) / units.force, contact.decay)
+
+
+class ImplicitContact:
+    """Contacts of one method: list, rows, forces and what they say of the step.
+
+    `response`: from row forces to the motion of the fibers.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model,
+        state: State,
+        step: StepArrays,
+        *,
+        flow_origin: np.ndarray,
+        stretch: float,
+        workers: int,
+        response: MovingResponse,
+        fiber_frozen: Any = None,
+    ) -> None:
+        self.scene, self.model, self.state, self.step = scene, model, state, step
+        self.response, self.flow_origin = response, flow_origin
+        self.hard = scene.numerics.contact == "unilateral"
+        radii = [row["radius"] for row in model.group_rows]
+        reach = 2.0 * max(radii) + KEEP * min(radii)
+        if scene.contact.lubrication != "none":
+            reach = max(reach, OUTER * 2.0 * max(radii))
+        self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
+        self.solves: list[tuple[ContactRows, ContactDual]] = []
+        for again in range(scene.numerics.linearizations or 1):
+            lattice = step.ends_lattice
+            rows = ContactRows(
+                model,
+                state,
+                self.search.list,
+                node_back=state.node_pos if again else step.node_back,
+                lattice_back=lattice[1:2] if again else lattice[0:1],
+                lattice_now=lattice[1:2],
+                step_size=step.step_size,
+                lubrication="none" if again else scene.contact.lubrication,
+            )
+            dual = ContactDual(
+                model,
+                state,
+                rows,
+                self.search.list,
+                response,
+                step_size=step.step_size,
+                node_start=step.node_back,
+                tolerance=(scene.numerics.contact_tolerance or 1e-3) * min(radii),
+                law=contact_law(scene, model),
+                fiber_frozen=fiber_frozen,
+            )
+            self.solves.append((rows, dual))
+        self.check = ContactCheck(
+            model,
+            state,
+            self.search.list,
+            node_back=step.node_back,
+            lattice_back=step.ends_lattice[0:1],
+            lattice_now=step.ends_lattice[1:2],
+        )
+        self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    def kernels(self) -> list[Any]:
+        """What the list needs beside the launches."""
+        return list(self.search.list.kernels.values())
+
+    def launches(self) -> Launches:
+        """From the motion without contact to the verdict on the step."""
+        state, step, verdict = self.state, self.step, make_contact_verdict()
+        found: Launches = [
+            *self.check.list_launches(state.node_pos, step.deformation_next, self.flow_origin)
+        ]
+        gate = [self.check.list_short, state.status, step.rejected]
+        found.append(Launch("gate", verdict["gate_list"], 1, gate))
+        for rows, dual in self.solves:
+            found += [*rows.launches(), *dual.launches(), self.response.apply(dual, carried=1.0)]
+        needs = [rows.row_need for rows, _ in self.solves]
+        judge = [
+            wp.float64(OVERLAP if self.hard else FINITE),
+            needs[0],
+            needs[1] if len(needs) > 1 else self.no_need,
+            self.check.largest,
+            self.check.found,
+            self.model.segment_fiber,
+            state.status,
+            step.verdict,
+        ]
+        return [
+            *found,
+            *self.check.launches(),
+            Launch("verdict", verdict["judge_contacts"], 1, judge),
+        ]
+
+    def settle(self, step: int) -> bool:
+        """Enlarge what was too small for the step; True if its launches are to be made anew."""
+        if any([rows.grow() for rows, _ in self.solves]):
+            words = self.state.status.numpy().copy()
+            words[[EXPIRED, HALT]] = 0
+            self.state.status.assign(words)
+            return True
+        if not self.search.use_up(step):
+            self.step.step_size.assign(0.5 * self.step.step_size.numpy())
+        return self.search.refresh(step)
+
+    # -- what is saved and told -------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next step depends on: list, skin and the forces of the last rows."""
+        arrays = self.search.saved()
+        for number, (rows, _) in enumerate(self.solves):
+            arrays |= {f"rows{number}_{key}": value for key, value in rows.saved().items()}
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
+        """Take over what `saved` returned."""
+        self.search.restore(arrays, step)
+        for number, (rows, _) in enumerate(self.solves):
+            head = f"rows{number}_"
+            rows.restore({key[len(head) :]: arrays[key] for key in arrays if key.startswith(head)})
+
+    def report(self) -> dict[str, float]:
+        """Rows, updates of the forces and the largest fault of the last step, radii."""
+        rows, dual = self.solves[0]
+        radius = min(row["radius"] for row in self.model.group_rows)
+        return {
+            "rows": int(rows.row_count.numpy()[0]),
+            "updates": dual.updates,
+            "fault": dual.fault / radius,
+        }
+
+    def fiber_push(self) -> np.ndarray:
+        """(F,) sum of the sizes of the contact forces on each fiber in the last step, run units."""
+        push: np.ndarray = np.zeros(self.model.fiber_count)
+        fiber = self.model.host["segment_fiber"]
+        for rows, _ in self.solves:
+            count = int(rows.row_count.numpy()[0])
+            force = np.abs(rows.row_force.numpy()[:count].astype(float))
+            for side in (rows.row_i, rows.row_j):
+                segment = side.numpy()[:count]
+                met = segment >= 0
+                np.add.at(push, fiber[segment[met]], force[met])
+        return push
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        self.search.close()

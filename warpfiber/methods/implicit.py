@@ -1,0 +1,255 @@
+"""Steps without inertia that may be taken back: what `overdamped` and `rigid_rod` share.
+
+A step: begin (flow and lattice at its ends), motion without contact, contact where there is any,
+end (time, flow; acceptance and the size of the next step where it may be rejected), take back.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.methods.contact import ImplicitContact, MovingResponse, StepArrays, has_contact
+from warpfiber.methods.method import Method
+from warpfiber.methods.strain_steps import step_start
+from warpfiber.model import EXPIRED, TORN, Model, State
+from warpfiber.passes.executor import Call, Launch, Repeat, flat, load_kernels
+from warpfiber.passes.pairs import PairFeatures
+from warpfiber.passes.step_control import (
+    ERROR_CHUNKS,
+    make_largest_error,
+    make_step_begin,
+    make_step_end,
+    make_take_back,
+)
+from warpfiber.scene import Scene
+
+Launches = list[Launch | Call | Repeat]
+
+
+class Implicit(Method):
+    """Advances a State without inertia; with a tolerance `dt` is the largest step."""
+
+    inertia = False
+
+    def __init__(
+        self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
+    ) -> None:
+        super().__init__(scene, model, state, dt, workers)
+        p, device = model.precision, model.device
+        self.adaptive = scene.numerics.tolerance is not None
+        self.meets = has_contact(scene)
+        self.keeps = self.adaptive or self.meets  # steps may be taken back
+        kept = model.node_count if self.keeps else 0
+        self.node_back = wp.zeros(kept, dtype=p.vec3, device=device)
+        self.velocity_back = wp.zeros(kept, dtype=p.vec3, device=device)
+        self.stage_gradient = wp.zeros(2, dtype=p.mat33, device=device)
+        self.strain_next = wp.zeros(1, dtype=wp.float64, device=device)
+        self.ends_lattice = wp.zeros(2, dtype=p.mat33, device=device)
+        self.deformation_next = wp.zeros(1, dtype=wp.mat33d, device=device)
+        self.verdict = wp.zeros(2, dtype=wp.int32, device=device)
+        self.rejected = wp.zeros(2, dtype=wp.int32, device=device)  # the last step, and in all
+        self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
+        chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
+        self.error = wp.zeros(chunks, dtype=wp.float64, device=device)
+        self.error_fiber = wp.zeros(chunks, dtype=wp.int32, device=device)
+        first = step_start(scene) / model.units.time if self.adaptive else self.dt
+        self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
+        self.contact: ImplicitContact | None = None
+
+    def _make_contact(self, response: MovingResponse) -> None:
+        """Contact, once the arrays of the method exist."""
+        if not self.meets or self.model.segment_count < 2:
+            return
+        scene, model = self.scene, self.model
+        frozen = np.asarray([group.frozen for group in scene.fibers])[model.host["fiber_group"]]
+        self.contact = ImplicitContact(
+            scene,
+            model,
+            self.state,
+            StepArrays(
+                self.node_back,
+                self.ends_lattice,
+                self.deformation_next,
+                self.step_size,
+                self.rejected,
+                self.verdict,
+            ),
+            flow_origin=self.flow_origin,
+            stretch=float(self._segment_stretch().max()),
+            workers=self.workers,
+            response=response,
+            fiber_frozen=wp.array(frozen, dtype=wp.uint8, device=model.device)
+            if frozen.any()
+            else None,
+        )
+        self.list, self.skin = self.contact.search.list, self.contact.search.skin
+        self.strain_end = self.contact.search.strain_end
+        self.pair_features = PairFeatures(
+            repulsion=scene.contact.law != "none",
+            lubrication=scene.contact.lubrication,
+            periodic=any(model.domain.periodic),
+            sheared=model.domain.sheared,
+        )
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    @abstractmethod
+    def motion(self) -> Launches:
+        """Launches that move every fiber without contact and keep the start where asked to."""
+
+    def launches(self) -> Launches:
+        """Begin, motion, contact and end of a step, and what a rejected one needs."""
+        return self._around(self.motion())
+
+    def _around(self, motion: Launches) -> Launches:
+        name = self.model.precision.name
+        steps: Launches = [self._begin(), *motion]
+        if self.contact is not None:
+            steps += self.contact.launches()
+        if self.adaptive:
+            chunks = self.error.shape[0]
+            errors = [chunks, self.fiber_error, self.error, self.error_fiber]
+            steps.append(Launch("errors", make_largest_error(name), chunks, errors))
+        steps.append(self._end())
+        if self.keeps:
+            steps.append(self._take_back())
+        return steps
+
+    def _begin(self) -> Launch:
+        state = self.state
+        inputs = [
+            wp.float64(self.flow_rate),
+            wp.mat33d(*self.full_gradient.ravel()),
+            self._schedule(),
+            self.step_size,
+            state.strain,
+            state.lattice,
+            state.deformation,
+            state.status,
+            self.rejected,
+            self.strain_next,
+            self.stage_gradient,
+            self.ends_lattice,
+            self.deformation_next,
+        ]
+        begin = make_step_begin(self.model.precision.name, self.model.domain.sheared)
+        return Launch("begin", begin, 1, inputs)
+
+    def _end(self) -> Launch:
+        model, state = self.model, self.state
+        tolerance = self.scene.numerics.tolerance or 0.0
+        judged = self.contact is not None
+        kernel = make_step_end(model.precision.name, model.domain.sheared, self.adaptive, judged)
+        inputs = [
+            wp.mat33d(*self.full_gradient.ravel()),
+            self._schedule(),
+            wp.float64(tolerance),
+            wp.float64(self.dt),
+            self.error,
+            self.error_fiber,
+            self.verdict,
+            self.strain_next,
+            self.step_size,
+            self.rejected,
+            state.step,
+            state.time,
+            state.strain,
+            state.gradient,
+            state.lattice,
+            state.lattice_now,
+            state.deformation,
+            state.status,
+        ]
+        return Launch("end", kernel, 1, inputs)
+
+    def _take_back(self) -> Launch:
+        model, state = self.model, self.state
+        tensions = self.tensions()
+        inputs = [
+            self.rejected,
+            model.fiber_node_start,
+            self.node_back,
+            self.velocity_back,
+            tensions[1],
+            state.node_pos,
+            state.node_velocity,
+            tensions[0],
+        ]
+        kernel = make_take_back(model.precision.name, tensions[0].shape[0] > 0)
+        return Launch("take_back", kernel, model.fiber_count, inputs, split=True)
+
+    def tensions(self) -> tuple[Any, Any]:
+        """Tensions now and at the start of the step; empty without."""
+        none = wp.zeros(0, dtype=self.model.precision.real, device=self.model.device)
+        return none, none
+
+    def _schedule(self) -> Any:
+        return wp.array(self.schedule, dtype=wp.vec2d, device=self.model.device)
+
+    def prepare(self, measuring: Iterable[Any] = ()) -> None:
+        """Compile, build the first list and capture, so that the next `advance` only steps."""
+        contact = self.contact
+        if contact is not None and contact.search.list.build_count == 0:
+            stepping = [x.kernel for x in flat(self.launches()) if isinstance(x, Launch)]
+            load_kernels([*stepping, *contact.kernels(), *measuring], self.model.device)
+            contact.search.refresh(self.step_count)
+            self.list_seconds = contact.search.seconds
+        super().prepare(measuring)
+
+    def _settle(self) -> bool:
+        """Do what halted the steps asks for, so that nothing is pending; False if a fiber tore."""
+        status = self._status()
+        if status[TORN]:
+            return False
+        if status[EXPIRED] and self.contact is not None:
+            if self.contact.settle(self.step_count):
+                self._stop_executor()
+            self.list_seconds = self.contact.search.seconds
+            self.strain_end = self.contact.search.strain_end
+        return True
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have, run units."""
+        return self.contact.search.box_width if self.contact is not None else 0.0
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        super().close()
+        if self.contact is not None:
+            self.contact.close()
+
+    # -- what is saved and told -------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Sizes of steps, and what contact depends on."""
+        arrays = {
+            f"implicit_{name}": getattr(self, name).numpy().copy()
+            for name in ("step_size", "rejected")
+        }
+        return arrays | (self.contact.saved() if self.contact is not None else {})
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take over what `saved` returned."""
+        for name in ("step_size", "rejected"):
+            getattr(self, name).assign(arrays[f"implicit_{name}"])
+        if self.contact is not None:
+            self.contact.restore(arrays, self.step_count)
+            self._stop_executor()
+
+    def list_report(self) -> dict[str, float]:
+        """Skins, builds and what they looked at; nothing without contact."""
+        return self.contact.search.report(self.step_count) if self.contact is not None else {}
+
+    def step_report(self) -> dict[str, float]:
+        """Rejected steps and the next dt in s, where they may change; rows of contact."""
+        report: dict[str, float] = {}
+        if self.keeps:
+            report["rejected_steps"] = int(self.rejected.numpy()[1])
+            report["next_dt"] = float(self.step_size.numpy()[0]) * self.model.units.time
+        return report | (self.contact.report() if self.contact is not None else {})

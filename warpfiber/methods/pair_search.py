@@ -1,0 +1,165 @@
+"""The search for pairs of a method: its neighbor list, the skin of the list, what builds cost.
+
+The list is built from the present positions; a skin that was used up is chosen anew, and grows
+where it did not last a single step.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from warpfiber.methods.box_limits import bearable_strain, lasting_height
+from warpfiber.methods.skin import LARGEST_CHANGE, LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
+from warpfiber.model import PAIR_COUNT, Model, State
+from warpfiber.passes.neighbors import NeighborList
+from warpfiber.scene import Scene
+
+
+class PairSearch:
+    """Neighbor list and skin; lengths in run units.
+
+    `reach`: distance of center lines up to which pairs are listed beside the skin.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model,
+        state: State,
+        *,
+        reach: float,
+        stretch: float,
+        workers: int,
+        native: bool | None = None,
+    ) -> None:
+        self.scene, self.model, self.state = scene, model, state
+        self.seconds = 0.0  # spent on builds
+        self.radius = max(row["radius"] for row in model.group_rows)
+        skin = START_SKIN * 2.0 * self.radius
+        if scene.numerics.skin is not None:
+            skin = scene.numerics.skin / model.units.length
+        self.list = NeighborList(
+            model,
+            state,
+            reach=reach,
+            skin=skin,
+            longest_rest=max(row["rest"] for row in model.group_rows),
+            stretch=stretch,
+            workers=workers,
+            native=native,
+        )
+        self.skin = self._skin_choice(skin)
+        self.strain_end = self.bearable_strain()
+
+    def _skin_choice(self, skin: float) -> SkinChoice:
+        """The start skin, and between what it may change."""
+        rows, pairs = self.model.group_rows, self.list
+        counts = np.bincount(self.model.host["fiber_group"], minlength=len(rows))
+        segments = counts * np.asarray([row["segments"] for row in rows])
+        return SkinChoice(
+            skin=skin,
+            start=skin,
+            radius=self.radius,
+            largest=self._largest_skin(skin),
+            least=min(skin, 2.0 * LEAST_SKIN * self.radius),
+            reach=pairs.reach,
+            core=2.0 * min(row["radius"] for row in rows),
+            length=float(np.average([row["rest"] for row in rows], weights=segments)),
+            pieces_per_segment=pairs.piece_count / self.model.segment_count,
+            fixed=self.scene.numerics.skin is not None,
+        )
+
+    def _largest_skin(self, start: float) -> float:
+        """What a lasting box has room for; a box that is flattened keeps the start skin."""
+        room = lasting_height(self.scene) / self.model.units.length
+        room -= self.list.cell_width - self.list.skin
+        most: float = min(2.0 * MOST_SKIN * self.radius, room * (1.0 - 1e-9))
+        return max(start, most)
+
+    def bearable_strain(self) -> float:
+        """Strain that the box can bear; raises SceneError if it is too small from the start."""
+        return bearable_strain(self.scene, self.box_width * self.model.units.length)
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have.
+
+        With the start skin: a run and its continuation have chosen others when they ask.
+        """
+        return self.list.cell_width - self.list.skin + self.skin.start
+
+    def set_skin(self, skin: float) -> None:
+        """Another skin, from the next list on."""
+        self.skin.set_skin(skin)
+        if skin != self.list.skin:
+            self.list.set_skin(skin)
+
+    def set_stretch(self, stretch: float) -> None:
+        """Take over a stretch of segments, from the next list on."""
+        self.list.set_stretch(stretch)
+        self.skin.largest = self._largest_skin(self.skin.start)
+        self.set_skin(min(self.skin.skin, self.skin.largest))
+        self.strain_end = self.bearable_strain()
+
+    def use_up(self, step: int) -> bool:
+        """Choose the next skin, the present one being used up; False if none would last a step."""
+        listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
+        short = step <= self.skin.built_step and self.list.build_count > 0
+        if short and (self.skin.fixed or self.skin.skin >= self.skin.largest):
+            return False
+        skin = self.skin.choose(step, listed)
+        if short:
+            skin = min(self.skin.largest, LARGEST_CHANGE * self.skin.skin)
+        self.set_skin(skin)
+        return True
+
+    def refresh(self, step: int, *, wrap: bool = True) -> bool:
+        """Build the list now (also clears its expiry); True if pair arrays were replaced."""
+        begin = time.perf_counter()
+        replaced = self.list.build(wrap=wrap)
+        self.seconds += time.perf_counter() - begin
+        self.skin.built(step)
+        return replaced
+
+    def report(self, step: int) -> dict[str, float]:
+        """Skins in largest diameters, builds and what they looked at."""
+        pairs, choice = self.list, self.skin
+        diameter = 2.0 * choice.radius
+        report: dict[str, float] = {
+            "skin_diameters": round(choice.skin / diameter, 4),
+            "skin_mean_diameters": round(choice.mean(step) / diameter, 4),
+            "builds": pairs.build_count,
+            "growths": pairs.grow_count,
+            "steps_per_build": round(choice.steps_counted(step) / max(1, pairs.build_count), 2),
+            "pairs": pairs.pair_count,
+            "pieces": pairs.piece_count,
+        }
+        return report | pairs.search_counts()
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        self.list.close()
+
+    # -- what is saved ----------------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next list depends on."""
+        allowed = np.asarray(self.list.stretch_allowed)
+        return {"stretch_allowed": allowed, "skin": self.skin.saved()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> bool:
+        """Build again the list that the saved run had, which was built from older positions."""
+        state = self.state
+        self.set_stretch(float(arrays["stretch_allowed"]))
+        self.set_skin(float(arrays["skin"][0]))
+        self.skin.begun = step
+        state.node_pos.assign(arrays["list_pos"])
+        state.lattice.assign(arrays["list_lattice"])
+        replaced = self.refresh(step, wrap=False)
+        self.skin.restore(arrays["skin"])
+        for name in ("node_pos", "lattice", "deformation"):
+            getattr(state, name).assign(arrays[name])
+        return replaced

@@ -1,0 +1,281 @@
+"""Contact forces on flexible fibers: their motion during the solve, and what the solution does.
+
+Source: `chain_reply`, the response of one fiber; during the solve by its blocks (`chain_blocks`).
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfiber.model import HALT, Model, precision
+from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
+from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
+from warpfiber.passes.chain_solve import CHI
+from warpfiber.passes.elimination import elimination_row
+from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.precision import group_struct
+from warpfiber.passes.unilateral import ContactDual
+
+BLOCK_SHARE = 32
+
+
+@cache
+def make_chain_response(name: str, has_frozen: bool) -> Any:
+    """Kernel `chain_response`, one thread per fiber: shift and tensions by the forces found."""
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    Group = group_struct(name)
+    Row = elimination_row(name)
+    chain_reply = make_chain_reply(name)
+    gather_push = make_gather_push(name)
+    zero = real(0.0)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def chain_response(
+        offset: wp.int32,
+        row_stride: wp.int32,
+        step_size: wp.array(dtype=wp.float64),
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        fiber_frozen: wp.array(dtype=wp.uint8),
+        rows: wp.array(dtype=Row),
+        row_out_start: wp.array(dtype=wp.int32),
+        fiber_in: wp.array(dtype=wp.int32),
+        row_next: wp.array(dtype=wp.int32),
+        row_j: wp.array(dtype=wp.int32),
+        row_s: wp.array(dtype=real),
+        row_t: wp.array(dtype=real),
+        row_normal: wp.array(dtype=vec3),
+        row_force: wp.array(dtype=real),
+        end_start: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+        node_push: wp.array(dtype=vec3),
+        node_reply: wp.array(dtype=vec3),
+        reply_impulse: wp.array(dtype=real),
+        segment_impulse: wp.array(dtype=real),
+        node_shift: wp.array(dtype=vec3),
+    ):
+        fiber = wp.tid() + offset
+        if status[wp.static(HALT)] != 0 or end_start[fiber] == end_start[fiber + 1]:
+            return
+        first = fiber_node_start[fiber]
+        segments = fiber_node_start[fiber + 1] - first - 1
+        pushed = gather_push(
+            fiber,
+            first,
+            segments,
+            row_out_start,
+            fiber_in,
+            row_next,
+            row_j,
+            row_s,
+            row_t,
+            row_normal,
+            row_force,
+            node_push,
+        )
+        if wp.static(has_frozen):
+            pushed = pushed and fiber_frozen[fiber] == wp.uint8(0)
+        if not pushed:
+            for i in range(first, first + segments + 1):
+                node_shift[i] = vec3()
+            for segment in range(first - fiber, first - fiber + segments):
+                segment_impulse[segment] = zero
+            return
+        chain_reply(
+            fiber,
+            first,
+            segments,
+            row_stride * fiber,
+            real(step_size[0]),
+            groups[fiber_group[fiber]],
+            rows,
+            node_push,
+            node_reply,
+            reply_impulse,
+            segment_impulse,
+            node_shift,
+        )
+
+    return chain_response
+
+
+@cache
+def make_chain_apply(name: str) -> Any:
+    """Kernel `chain_apply`, one thread per fiber: moved by its shift, tensions added.
+
+    `carried`: share of the shift's velocity that `node_velocity` takes up.
+    """
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    chi = real(CHI)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def chain_apply(
+        offset: wp.int32,
+        carried: real,
+        step_size: wp.array(dtype=wp.float64),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        end_start: wp.array(dtype=wp.int32),
+        node_shift: wp.array(dtype=vec3),
+        segment_impulse: wp.array(dtype=real),
+        status: wp.array(dtype=wp.int32),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        tension: wp.array(dtype=real),
+    ):
+        fiber = wp.tid() + offset
+        if status[wp.static(HALT)] != 0 or end_start[fiber] == end_start[fiber + 1]:
+            return
+        first = fiber_node_start[fiber]
+        last = fiber_node_start[fiber + 1] - 1
+        dt = real(step_size[0])
+        for i in range(first, last + 1):
+            node_pos[i] = node_pos[i] + node_shift[i]
+            node_velocity[i] = node_velocity[i] + (carried / dt) * node_shift[i]
+            if i < last:
+                tension[i - fiber] = tension[i - fiber] + segment_impulse[i - fiber] / (chi * dt)
+
+    return chain_apply
+
+
+class ChainResponse:
+    """The response of a cell of flexible fibers; `ContactDual` takes an instance.
+
+    rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
+    block_share: numbers per end in `block`, the ends that a fiber may have on average.
+    """
+
+    by_ends = True
+
+    def __init__(
+        self,
+        model: Model,
+        rows: Any,
+        row_stride: int,
+        tension: Any,
+        block_share: int = BLOCK_SHARE,
+    ) -> None:
+        self.block_share = block_share
+        self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
+        p, nodes = model.precision, model.node_count
+        self.node_push = self._array(nodes, p.vec3)
+        self.node_reply = self._array(nodes, p.vec3)
+        self.reply_impulse = self._array(nodes, p.real)
+        self.segment_impulse = self._array(model.segment_count, p.real)
+        self.end_start = self._array(model.fiber_count + 1, wp.int32)
+        self.block_start = self._array(model.fiber_count, wp.int32)
+        self._allocate(0)
+
+    def _array(self, size: int, dtype: Any) -> Any:
+        return wp.zeros(size, dtype=dtype, device=self.model.device)
+
+    def _allocate(self, ends: int) -> None:
+        real = self.model.precision.real
+        self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
+        self.end_known = self._array(ends, wp.uint8)
+        self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
+        self.block = self._array(self.block_share * ends, real)
+
+    def begin(self, dual: ContactDual) -> list[Launch | Call]:
+        """Ends and blocks of every fiber, for rows of the present capacity."""
+        model, rows, status = self.model, dual.rows, dual.state.status
+        self._allocate(2 * rows.row_i.shape[0])
+        fibers = model.fiber_count
+        kernels = make_end_kernels(model.precision.name)
+        lists = [rows.row_out_start, dual.fiber_in, dual.row_next]
+        counted = [model.fiber_node_start, rows.row_count, *lists, self.end_start]
+        scanned = [fibers, self.block.shape[0], status, self.end_start, self.block_start]
+        filled = [
+            model.fiber_node_start,
+            *lists,
+            rows.row_j,
+            self.end_start,
+            status,
+            self.row_end,
+            self.end_row,
+            self.end_known,
+            self.end_force,
+            self.end_move,
+        ]
+        return [
+            Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
+            Launch("end_scan", kernels["end_scan"], 1, scanned),
+            Launch("end_fill", kernels["end_fill"], fibers, filled, split=True),
+        ]
+
+    def _fibers(self, dual: ContactDual) -> list[Any]:
+        model = self.model
+        return [
+            self.row_stride,
+            dual.step_size,
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            dual.fiber_frozen,
+            self.rows,
+            dual.rows.row_out_start,
+            dual.fiber_in,
+            dual.row_next,
+            dual.rows.row_j,
+        ]
+
+    def _rows(self, dual: ContactDual) -> list[Any]:
+        rows = dual.rows
+        return [rows.row_s, rows.row_t, rows.row_normal, rows.row_force, self.end_start]
+
+    def _work(self, dual: ContactDual) -> list[Any]:
+        made = [self.reply_impulse, self.segment_impulse, dual.node_shift]
+        return [self.node_push, self.node_reply, *made]
+
+    def repeat(self, dual: ContactDual) -> Launch:
+        """Motion of the ends of all rows."""
+        model = self.model
+        inputs = [
+            *self._fibers(dual),
+            dual.row_node,
+            *self._rows(dual),
+            self.block_start,
+            self.end_row,
+            dual.control,
+            *self._work(dual),
+            self.block,
+            self.end_known,
+            self.end_force,
+            self.end_move,
+        ]
+        kernel = make_chain_moves(model.precision.name, dual.has_frozen)
+        return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
+
+    def end(self, dual: ContactDual) -> list[Launch | Call]:
+        """Shift and tensions of the solution."""
+        model = self.model
+        inputs = [*self._fibers(dual), *self._rows(dual), dual.state.status, *self._work(dual)]
+        kernel = make_chain_response(model.precision.name, dual.has_frozen)
+        return [Launch("chain_response", kernel, model.fiber_count, inputs, split=True)]
+
+    def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
+        """Moves the fibers by the solution and adds its tensions."""
+        model, state = self.model, dual.state
+        inputs = [
+            carried,
+            dual.step_size,
+            model.fiber_node_start,
+            self.end_start,
+            dual.node_shift,
+            self.segment_impulse,
+            state.status,
+            state.node_pos,
+            state.node_velocity,
+            self.tension,
+        ]
+        kernel = make_chain_apply(model.precision.name)
+        return Launch("chain_apply", kernel, model.fiber_count, inputs, split=True)
+
+
+def chain_response_bytes(nodes: int, segments: int, rows: int, real: int) -> int:
+    """Bytes of the arrays of `ChainResponse`, for reals of `real` bytes."""
+    per_row = 2 * (8 + 1 + (2 + BLOCK_SHARE) * real)
+    return nodes * 7 * real + segments * real + rows * per_row

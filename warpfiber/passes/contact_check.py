@@ -1,0 +1,128 @@
+"""Check of a step with contact: does its end overlap or cross, and does the list still hold.
+
+Source: see `check_sweeps` and `list_bound`.
+Symbols: run units; overlap in radii of the thinner fiber.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.model import Model, State
+from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
+from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.list_bound import make_list_bound
+from warpfiber.passes.neighbors import NeighborList
+
+CHUNKS = 128
+
+
+class ContactCheck:
+    """What a step did: read `largest`, `found` and `list_short` after the launches.
+
+    `largest` (1) float64: largest overlap at the end of the step, radii (0: none); 1e30 where a
+    position is not finite. `found` (5) int32: how many pairs passed through each other and nodes
+    through walls; segment and partner of the largest overlap; segment and partner of a crossing
+    (-1: none, as a partner a wall). `list_short` (1) int32: 1 if the list may miss a pair that
+    is within its reach where the step would end.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        pairs: NeighborList,
+        *,
+        node_back: Any,
+        lattice_back: Any,
+        lattice_now: Any,
+    ) -> None:
+        self.model, self.state, self.pairs = model, state, pairs
+        self.node_back = node_back
+        self.lattice_back, self.lattice_now = lattice_back, lattice_now
+        domain, name = model.domain, model.precision.name
+        self.kernels = dict(
+            make_check_sweeps(name, CheckFeatures(any(domain.periodic), domain.wall))
+        )
+        self.kernels |= make_list_bound(name)
+        segments = model.segment_count
+        self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
+        self.overlap_partner, self.crossed = self._int(segments), self._int(segments)
+        self.crossed_partner = self._int(segments)
+        chunks = min(CHUNKS, segments)
+        self.overlap_at, self.crossed_of = self._int(chunks), self._int(chunks)
+        self.crossed_at = self._int(chunks)
+        self.largest = wp.zeros(1, dtype=wp.float64, device=model.device)
+        self.found = self._int(5)
+        self.fiber_short = self._int(model.fiber_count)
+        self.list_short = self._int(1)
+
+    def _int(self, size: int) -> Any:
+        return wp.zeros(size, dtype=wp.int32, device=self.model.device)
+
+    def launches(self) -> list[Launch | Call]:
+        """Overlaps and crossings at the end of the step; anew after the list grew."""
+        model, state, pairs = self.model, self.state, self.pairs
+        p, domain = model.precision, model.domain
+        low = np.asarray(domain.low)
+        widest = max(row["radius"] for row in model.group_rows)
+        segments = [
+            p.real(widest),
+            p.vec3(*low),
+            p.vec3(*(low + np.asarray(domain.size))),
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            model.segment_node,
+            model.segment_fiber,
+            pairs.out_start,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.lattice_back,
+            self.lattice_now,
+            self.node_back,
+            state.node_pos,
+            state.status,
+            self.overlap,
+            self.overlap_partner,
+            self.crossed,
+            self.crossed_partner,
+        ]
+        chunks = self.overlap_at.shape[0]
+        reduced = [self.overlap_at, self.crossed_of, self.crossed_at]
+        finish = [self.overlap, self.overlap_partner, self.crossed_partner, *reduced]
+        return [
+            self._launch("check_segments", model.segment_count, segments, split=True),
+            self._launch(
+                "reduce_check",
+                chunks,
+                [chunks, self.overlap, self.crossed, state.status, *reduced],
+            ),
+            self._launch("finish_check", 1, [*finish, state.status, self.largest, self.found]),
+        ]
+
+    def list_launches(
+        self, node_pos: Any, deformation: Any, flow_origin: np.ndarray
+    ) -> list[Launch | Call]:
+        """Whether the list holds for `node_pos`, its flow since the build being `deformation`."""
+        model, state = self.model, self.state
+        bound = [
+            model.precision.vec3(*flow_origin),
+            self.pairs.skin_out,
+            model.fiber_node_start,
+            deformation,
+            state.list_pos,
+            node_pos,
+            state.status,
+            self.fiber_short,
+        ]
+        return [
+            self._launch("bound_fibers", model.fiber_count, bound, split=True),
+            self._launch("bound_list", 1, [self.fiber_short, state.status, self.list_short]),
+        ]
+
+    def _launch(self, name: str, dim: int, inputs: list[Any], split: bool = False) -> Launch:
+        return Launch(name, self.kernels[name], dim, inputs, split=split)

@@ -1,0 +1,258 @@
+"""Rows of contact of one step, on the device: pairs of segments, plane walls, lubricated beads.
+
+A step makes them anew from the neighbor list: carry the last forces, count, running sum, fill. The
+rows of a segment are next to each other, in the order of its pairs, then those of walls. Too many
+rows for the capacity are none at all, and the need is told; after `grow` the step is repeated.
+
+Source: see `row_geometry`, `row_count`, `row_fill`.
+Symbols: run units; force f constant over the step, along the normal on j, against it on i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.model import Model, State
+from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.row_count import RowFeatures, make_row_count
+from warpfiber.passes.row_fill import make_row_fill
+
+KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap are kept
+GROWTH = 1.3
+
+
+class ContactRows:
+    """Rows of the step under way; `launches` of a step, `grow` where `row_need` asks for it.
+
+    Rows (capacity): `row_i`, `row_j`, `row_s`, `row_t`, `row_normal`, `row_base`,
+    `row_compliance`, `row_force`; those of segment i are `row_out_start[i:i+2]`, those of listed
+    pair k the `pair_row_count[k]` from `pair_row[k]` on; `row_count` (1) in all, `row_need` (1) is
+    0 unless they do not fit.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        pairs: NeighborList,
+        *,
+        node_back: Any,
+        lattice_back: Any,
+        lattice_now: Any,
+        step_size: Any,
+        keep: float = KEEP,
+        lubrication: str = "none",
+        capacity: int | None = None,
+    ) -> None:
+        self.model, self.state, self.pairs = model, state, pairs
+        self.node_back, self.step_size = node_back, step_size
+        self.lattice_back, self.lattice_now = lattice_back, lattice_now
+        self.keep = keep
+        domain = model.domain
+        self.features = RowFeatures(any(domain.periodic), domain.wall, lubrication)
+        self.kernels = dict(make_row_count(model.precision.name, self.features))
+        self.kernels["fill_rows"] = make_row_fill(model.precision.name, self.features)
+        segments = model.segment_count
+        self.row_out_start = self._int(segments + 1)
+        self.carried_start = self._int(segments + 1)
+        self.segment_rows = self._int(segments)
+        self.row_count, self.row_need = self._int(1), self._int(1)
+        self._allocate_rows(capacity or max(64, segments))
+        self._fit_pairs()
+
+    # -- arrays -----------------------------------------------------------------------------------
+
+    def _int(self, size: int) -> Any:
+        return wp.zeros(size, dtype=wp.int32, device=self.model.device)
+
+    def _allocate_rows(self, capacity: int) -> None:
+        p, device = self.model.precision, self.model.device
+
+        def reals() -> Any:
+            return wp.zeros(capacity, dtype=p.real, device=device)
+
+        self.capacity = capacity
+        self.row_i, self.row_j = self._int(capacity), self._int(capacity)
+        self.row_key, self.carried_j = self._int(capacity), self._int(capacity)
+        self.carried_key = self._int(capacity)
+        self.row_s, self.row_t, self.row_base = reals(), reals(), reals()
+        self.row_compliance, self.row_force, self.carried_force = reals(), reals(), reals()
+        self.row_normal = wp.zeros(capacity, dtype=p.vec3, device=device)
+
+    def _fit_pairs(self) -> None:
+        """Room for as many pairs as the list may hold."""
+        self.pair_capacity = self.pairs.pair_capacity
+        self.pair_row = self._int(self.pair_capacity)
+        self.pair_row_count = self._int(self.pair_capacity)
+        self.pair_slots = wp.zeros(self.pair_capacity, dtype=wp.uint8, device=self.model.device)
+
+    def grow(self) -> bool:
+        """More room if the last step did not fit; then its launches are to be made again."""
+        need = int(self.row_need.numpy()[0])
+        if need == 0:
+            return False
+        kept = self._carried()
+        self._allocate_rows(max(int(GROWTH * need), self.capacity + 1))
+        self._put(kept)
+        self.row_need.zero_()
+        return True
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    def launches(self) -> list[Launch | Call]:
+        """Rows at the start of the step, `state.node_pos` being where it would end without them.
+
+        To be asked for again after the list or the rows grew.
+        """
+        if self.pair_capacity != self.pairs.pair_capacity:
+            self._fit_pairs()
+        segments = self.model.segment_count
+
+        def scan() -> None:
+            wp.utils.array_scan(self.segment_rows, self.row_out_start[1:], inclusive=True)
+
+        limit = [
+            segments,
+            self.capacity,
+            self.row_out_start,
+            self.state.status,
+            self.row_count,
+            self.row_need,
+        ]
+        return [
+            self._launch("carry_rows", self._carry_inputs()),
+            self._launch("count_rows", self._count_inputs(), follows=True),
+            Call("row_scan", scan),
+            Launch("limit_rows", self.kernels["limit_rows"], 1, limit),
+            self._launch("fill_rows", self._fill_inputs()),
+        ]
+
+    def _launch(self, name: str, inputs: list[Any], follows: bool = False) -> Launch:
+        dim = self.model.segment_count
+        return Launch(name, self.kernels[name], dim, inputs, split=True, follows=follows)
+
+    def _carry_inputs(self) -> list[Any]:
+        return [
+            self.row_out_start,
+            self.row_j,
+            self.row_key,
+            self.row_force,
+            self.state.status,
+            self.carried_start,
+            self.carried_j,
+            self.carried_key,
+            self.carried_force,
+        ]
+
+    def _walls(self) -> list[Any]:
+        vec3, domain = self.model.precision.vec3, self.model.domain
+        low = np.asarray(domain.low)
+        return [vec3(*low), vec3(*(low + np.asarray(domain.size)))]
+
+    def _fibers(self) -> list[Any]:
+        model, pairs = self.model, self.pairs
+        return [
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            model.segment_node,
+            model.segment_fiber,
+            pairs.out_start,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.lattice_back,
+            self.lattice_now,
+        ]
+
+    def _count_inputs(self) -> list[Any]:
+        real, state = self.model.precision.real, self.state
+        widest = max(row["radius"] for row in self.model.group_rows)
+        return [
+            real(self.keep),
+            real(widest),
+            *self._walls(),
+            *self._fibers(),
+            self.node_back,
+            state.node_pos,
+            state.status,
+            self.pair_slots,
+            self.pair_row_count,
+            self.segment_rows,
+        ]
+
+    def _fill_inputs(self) -> list[Any]:
+        state = self.state
+        return [
+            self.model.precision.real(self.keep),
+            *self._walls(),
+            *self._fibers(),
+            state.fiber_image,
+            self.node_back,
+            state.node_pos,
+            self.step_size,
+            self.carried_start,
+            self.carried_j,
+            self.carried_key,
+            self.carried_force,
+            self.row_need,
+            self.pair_slots,
+            self.pair_row_count,
+            state.status,
+            self.row_out_start,
+            self.pair_row,
+            self.row_i,
+            self.row_j,
+            self.row_key,
+            self.row_s,
+            self.row_t,
+            self.row_normal,
+            self.row_base,
+            self.row_compliance,
+            self.row_force,
+        ]
+
+    # -- what is saved ----------------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Forces of the last rows, by segment, partner and key: where the next step starts."""
+        rows = int(self.row_out_start.numpy()[-1])
+        return {
+            "row_out_start": self.row_out_start.numpy().copy(),
+            "row_j": self.row_j.numpy()[:rows].copy(),
+            "row_key": self.row_key.numpy()[:rows].copy(),
+            "row_force": self.row_force.numpy()[:rows].copy(),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take over what `saved` returned."""
+        rows = len(arrays["row_j"])
+        if rows > self.capacity:
+            self._allocate_rows(int(GROWTH * rows))
+        self._put(arrays)
+
+    def _carried(self) -> dict[str, np.ndarray]:
+        start = self.carried_start.numpy().copy()
+        rows = int(start[-1])
+        return {
+            "row_out_start": start,
+            "row_j": self.carried_j.numpy()[:rows].copy(),
+            "row_key": self.carried_key.numpy()[:rows].copy(),
+            "row_force": self.carried_force.numpy()[:rows].copy(),
+        }
+
+    def _put(self, arrays: Mapping[str, np.ndarray]) -> None:
+        start = np.asarray(arrays["row_out_start"])
+        self.row_out_start.assign(start)
+        # a step that is halted before its count still takes the running sum
+        self.segment_rows.assign(np.diff(start))
+        for key in ("row_j", "row_key", "row_force"):
+            values = np.asarray(arrays[key])
+            array = getattr(self, key)
+            whole = np.zeros(self.capacity, dtype=array.numpy().dtype)
+            whole[: len(values)] = values
+            array.assign(whole)

@@ -1,0 +1,247 @@
+"""Rows of the dual problem of contact: projected gradients and balance.
+
+Source: projected gradients with the two Barzilai-Borwein steps in turn (BBPGD) for
+        contact:      0 <= f  and  e = b + J delta(f) + y(f) >= 0, one of them an equality
+        lubrication:  e = b + J delta(f) + C f = 0, any sign of f
+    in the scaled unknowns x = f/m, m = (D + C)^(-1/2), of gradient m e:
+        f <- max(0, f - alpha m^2 e);  alpha = dx.dx/dx.dg and dx.dg/dg.dg in turn, first 0.3
+Symbols: w = m^2 weight of a row; dx.dx = sum df^2/w, dx.dg = sum df de, dg.dg = sum w de^2; D
+    estimate of the diagonal of J S J^T, S response of the fibers; fault of a row, a length: |e|
+    where f > 0 or lubrication (times D/(D + C)), else |min(e, 0)|.
+    control: phase and number of updates as all threads read them, then what the next pass reads.
+Limits: rows in `chunks` runs whose sums are added in order, so the result does not depend on the
+    number of workers. The forces of the smallest fault are kept.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpfiber.laws.contact_compliance import make_contact_compliance
+from warpfiber.model import precision
+
+FIRST_STEP = 0.3
+START, GO, RESTORE, DONE = range(4)  # phases of the solve
+PHASE, UPDATES, NEXT_PHASE, NEXT_UPDATES = range(4)  # slots of `control`
+CONTROL_SIZE = 4
+SUMS = 4  # dx.dx, dx.dg, dg.dg, largest fault
+BROKEN = 1e30  # the fault of a row that is not a number
+
+
+@wp.func
+def rows_begin(count: wp.int32, chunk: wp.int32, chunks: wp.int32) -> wp.int32:
+    """First row of a chunk."""
+    return wp.int32(wp.int64(count) * wp.int64(chunk) / wp.int64(chunks))
+
+
+@cache
+def make_dual_step(name: str):
+    """Kernel `dual_step` (rows in chunks): the next forces, or the end of the solve."""
+    real = precision(name).real
+    zero, first_step = real(0.0), wp.constant(FIRST_STEP)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def dual_step(
+        offset: wp.int32,
+        chunks: wp.int32,
+        most: wp.int32,
+        tolerance: wp.float64,
+        row_count: wp.array(dtype=wp.int32),
+        row_compliance: wp.array(dtype=real),
+        row_weight: wp.array(dtype=real),
+        row_balance: wp.array(dtype=real),
+        sums: wp.array(dtype=wp.float64),
+        row_force: wp.array(dtype=real),
+        row_best: wp.array(dtype=real),
+        row_change: wp.array(dtype=real),
+        best: wp.array(dtype=wp.float64),
+        control: wp.array(dtype=wp.int32),
+    ):
+        phase = control[wp.static(PHASE)]
+        if phase == wp.static(DONE):
+            return
+        chunk = wp.tid() + offset
+        updates = control[wp.static(UPDATES)]
+        moved = wp.float64(0.0)  # dx.dx
+        mixed = wp.float64(0.0)  # dx.dg
+        turned = wp.float64(0.0)  # dg.dg
+        fault = wp.float64(0.0)
+        alpha = wp.float64(first_step)
+        least = best[0]
+        following = wp.int32(wp.static(GO))
+        keeps = wp.bool(False)
+        if phase == wp.static(RESTORE):
+            following = wp.static(DONE)
+        if phase == wp.static(GO):
+            for k in range(sums.shape[0] // wp.static(SUMS)):
+                moved += sums[wp.static(SUMS) * k]
+                mixed += sums[wp.static(SUMS) * k + 1]
+                turned += sums[wp.static(SUMS) * k + 2]
+                fault = wp.max(fault, sums[wp.static(SUMS) * k + 3])
+            keeps = fault < least
+            least = wp.min(fault, least)
+            if fault < tolerance:
+                following = wp.static(DONE)
+            elif updates == most:
+                following = wp.static(RESTORE)
+                if keeps:
+                    following = wp.static(DONE)
+            if updates % 2 == 0:
+                moved = mixed
+                mixed = turned
+            if moved > wp.float64(0.0) and mixed > wp.float64(0.0):
+                alpha = moved / mixed
+        runs = phase == wp.static(GO) and following == wp.static(GO)
+        if chunk == 0:
+            control[wp.static(NEXT_PHASE)] = following
+            if runs:
+                control[wp.static(NEXT_UPDATES)] = updates + 1
+            best[1] = least
+        if not runs and following != wp.static(RESTORE):
+            return
+        count = row_count[0]
+        scale = real(alpha)
+        for r in range(rows_begin(count, chunk, chunks), rows_begin(count, chunk + 1, chunks)):
+            if runs:
+                force = row_force[r]
+                if keeps:
+                    row_best[r] = force
+                new = force - scale * row_weight[r] * row_balance[r]
+                if row_compliance[r] == zero:
+                    new = wp.max(new, zero)
+                row_change[r] = new - force
+                row_force[r] = new
+            else:
+                row_force[r] = row_best[r]
+
+    return dual_step
+
+
+@cache
+def make_dual_balance(name: str, law: str, by_ends: bool):
+    """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
+
+    `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`.
+    """
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    opening, _ = make_contact_compliance(name, law)
+    zero, one = real(0.0), real(1.0)
+    broken = real(BROKEN)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def dual_balance(
+        offset: wp.int32,
+        chunks: wp.int32,
+        stiffness: real,
+        decay: real,
+        row_count: wp.array(dtype=wp.int32),
+        row_node: wp.array(dtype=wp.vec2i),
+        row_s: wp.array(dtype=real),
+        row_t: wp.array(dtype=real),
+        row_normal: wp.array(dtype=vec3),
+        row_base: wp.array(dtype=real),
+        row_compliance: wp.array(dtype=real),
+        row_contact: wp.array(dtype=real),
+        row_weight: wp.array(dtype=real),
+        row_force: wp.array(dtype=real),
+        row_change: wp.array(dtype=real),
+        node_shift: wp.array(dtype=vec3),
+        row_end: wp.array(dtype=wp.int32),
+        end_move: wp.array(dtype=real),
+        row_balance: wp.array(dtype=real),
+        sums: wp.array(dtype=wp.float64),
+        best: wp.array(dtype=wp.float64),
+        control: wp.array(dtype=wp.int32),
+        going: wp.array(dtype=wp.int32),
+    ):
+        chunk = wp.tid() + offset
+        phase = control[wp.static(NEXT_PHASE)]
+        if chunk == 0:
+            control[wp.static(PHASE)] = phase
+            control[wp.static(UPDATES)] = control[wp.static(NEXT_UPDATES)]
+            best[0] = best[1]
+            if phase == wp.static(DONE):
+                going[0] = 0
+        if phase != wp.static(GO):
+            return
+        count = row_count[0]
+        moved = wp.float64(0.0)
+        mixed = wp.float64(0.0)
+        turned = wp.float64(0.0)
+        worst = real(0.0)
+        for r in range(rows_begin(count, chunk, chunks), rows_begin(count, chunk + 1, chunks)):
+            e = row_base[r]
+            if wp.static(by_ends):
+                e += end_move[row_end[2 * r]]
+                if row_end[2 * r + 1] >= 0:
+                    e += end_move[row_end[2 * r + 1]]
+            else:
+                node = row_node[r]
+                s = row_s[r]
+                move = -(one - s) * node_shift[node[0]] - s * node_shift[node[0] + 1]
+                if node[1] >= 0:
+                    t = row_t[r]
+                    move += (one - t) * node_shift[node[1]] + t * node_shift[node[1] + 1]
+                e += wp.dot(row_normal[r], move)
+            force = row_force[r]
+            soft = row_compliance[r]
+            weight = row_weight[r]
+            fault = zero
+            if soft > zero:
+                e += soft * force
+                fault = wp.abs(e) * (one - soft * weight)
+            else:
+                contact = zero
+                if wp.static(law == "exponential"):
+                    contact = row_contact[r]
+                e += opening(stiffness, decay, contact, force)
+                fault = wp.abs(e)
+                if force == zero:
+                    fault = -wp.min(e, zero)
+            if not (fault < broken) or wp.isnan(e):
+                fault = broken
+            de = wp.float64(e - row_balance[r])
+            df = wp.float64(row_change[r])
+            row_balance[r] = e
+            if weight > zero:  # else nothing that the row touches can move
+                worst = wp.max(worst, fault)
+                moved += df * df / wp.float64(weight)
+                mixed += df * de
+                turned += wp.float64(weight) * de * de
+        sums[wp.static(SUMS) * chunk] = moved
+        sums[wp.static(SUMS) * chunk + 1] = mixed
+        sums[wp.static(SUMS) * chunk + 2] = turned
+        sums[wp.static(SUMS) * chunk + 3] = wp.float64(worst)
+
+    return dual_balance
+
+
+@cache
+def make_fold_sums():
+    """Kernel `fold_sums`: the sums of many chunks as those of `folds` runs of them."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def fold_sums(
+        chunks: wp.int32,
+        folds: wp.int32,
+        sums: wp.array(dtype=wp.float64),
+        control: wp.array(dtype=wp.int32),
+        folded: wp.array(dtype=wp.float64),
+    ):
+        if control[wp.static(PHASE)] != wp.static(GO):
+            return
+        fold = wp.tid()
+        total = wp.vec3d()
+        worst = wp.float64(0.0)
+        for k in range(rows_begin(chunks, fold, folds), rows_begin(chunks, fold + 1, folds)):
+            at = wp.static(SUMS) * k
+            total += wp.vec3d(sums[at], sums[at + 1], sums[at + 2])
+            worst = wp.max(worst, sums[at + 3])
+        at = wp.static(SUMS) * fold
+        folded[at] = total[0]
+        folded[at + 1] = total[1]
+        folded[at + 2] = total[2]
+        folded[at + 3] = worst
+
+    return fold_sums
