@@ -225,7 +225,8 @@ def _segments(draft: Draft, group: Values, index: int, place: str, asked: float)
 def _resolve_contact(draft: Draft) -> None:
     """Default strength D_0 = 1000 eta rate a^2 of the thickest fibers."""
     contact = draft.contact
-    if contact["law"] != "exponential" and not draft.axes("wall"):
+    pushing = contact["law"] == "exponential" or bool(draft.axes("wall"))
+    if draft.method == "bonded_spheres" or not pushing:
         contact["strength"], contact["decay"] = 0.0, 50.0
         return
     if contact["law"] == "none":  # no pairs, but walls still hold
