@@ -25,7 +25,7 @@ ROOMS = (
     {"placement", "passes"},
     {"build", "methods", "output"},
     {"simulation"},
-    {"summary", "stopping", "restart", "recording"},
+    {"summary", "stopping", "restart", "recording", "trial"},
     {"job", "checking", "progress"},
     {"__main__"},
 )

@@ -147,10 +147,10 @@ def _finish(job: Any, code: int, quiet: bool) -> None:
 def _check(args: argparse.Namespace) -> int:
     from warpfiber.build import realized_scene
     from warpfiber.checking import check_lines
-    from warpfiber.placement import place_fibers
+    from warpfiber.placement import place_fibers, split_tables
     from warpfiber.simulation import check_step
 
-    scene = _load(args)
+    scene = split_tables(_load(args))
     if any(group.node_file for group in scene.fibers):
         scene = realized_scene(scene, place_fibers(scene))
     print("\n".join(check_lines(scene)))

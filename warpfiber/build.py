@@ -24,7 +24,7 @@ from warpfiber.model import (
     precision,
 )
 from warpfiber.passes.precision import group_struct
-from warpfiber.placement import Placement, place_fibers
+from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import INERTIALESS
 
@@ -167,6 +167,7 @@ def build(
     scene: Scene, device: str, placement: Placement | None = None
 ) -> tuple[Model, State, dict[str, Any]]:
     """Model and state of a scene on `device`, and the report of the placement."""
+    scene = split_tables(scene)
     placement = placement or place_fibers(scene)
     p = precision(scene.numerics.precision)
     units = choose_units(scene)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 from warpfiber.methods.bead_chain import contact_reach
 from warpfiber.methods.box_limits import bearable_strain
 from warpfiber.methods.overdamped import overdamped_bytes
 from warpfiber.methods.skin import START_SKIN
-from warpfiber.methods.stability import chosen_step, step_limits
+from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.methods.strain_steps import LARGEST_STRAIN
 from warpfiber.passes.neighbors import FIRST_STRETCH
 from warpfiber.scene import FiberGroup, Scene
@@ -98,6 +99,47 @@ def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str,
     return rows
 
 
+def _table_lines(scene: Scene, table: int) -> list[tuple[str, str]]:
+    """One table of fibers of many lengths, or in layers."""
+    groups = [group for group in scene.fibers if group.table == table]
+    asked = groups[0]
+    count = sum(group.count for group in groups)
+    total = sum(group.count * group.length for group in groups)
+    square = sum(group.count * group.length**2 for group in groups)
+    fraction = sum(group.volume_fraction_achieved or 0.0 for group in groups)
+    stiff = [effective_stiffness(scene, group) for group in (groups[-1], groups[0])]
+    least, most = (pick(group.segments for group in groups) for pick in (min, max))
+    share = "" if asked.volume_fraction is None else f" ({asked.volume_fraction:.4g})"
+    rows = [
+        (f"fibers.{table} count", f"{count} in {len(groups)} lengths"),
+        ("number average length L_N", f"{total / count:.5g} m"),
+        ("weight average length L_W", f"{square / total:.5g} m"),
+        ("shortest and longest fiber", f"{groups[0].length:.4g} and {groups[-1].length:.4g} m"),
+        ("volume fraction V_f (asked)", f"{_number(fraction)}{share}"),
+        ("V_f L_N / d", _number(fraction * total / count / asked.diameter)),
+        ("S_eff of the longest and the shortest", " and ".join(map(_number, stiff))),
+        ("segments per fiber N_seg", f"{least} to {most}"),
+        (
+            "nodes / segments",
+            f"{sum(map(node_count, groups))} / {sum(map(segment_count, groups))}",
+        ),
+    ]
+    if asked.layers is not None:
+        rows.append((f"layers ({asked.layer_mode})", f"{len(asked.layers)}"))
+    return rows
+
+
+def _limits_told(scene: Scene, limits: tuple[StepLimit, ...]) -> list[StepLimit]:
+    """The limits, of the groups of one table only the smallest of each term."""
+    told: dict[tuple[str, bool, int], StepLimit] = {}
+    for limit in limits:
+        table = scene.fibers[limit.group].table
+        home = limit.group if table is None else table
+        named = dataclasses.replace(limit, group=home)
+        told.setdefault((limit.term, table is None, home), named)
+    return list(told.values())
+
+
 def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     """Method, limits of the step, step and number of steps."""
     numerics = scene.numerics
@@ -105,6 +147,8 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
     rows = [("method", " ".join(filter(None, [numerics.method, numerics.integrator])))]
     if scene.method_reason is not None:
         rows.append(("chosen by auto", scene.method_reason))
+    if scene.rod_trial is not None:
+        rows.append(("rods instead", "if a trial of the run shows that contact does not bend them"))
     if numerics.method == "rigid_rod":
         rows.append(("dt limit", limits[0].term))
         share = f" = strain {dt * scene.flow.rate:.3g}" if scene.flow and scene.flow.rate else ""
@@ -120,7 +164,7 @@ def _step_lines(scene: Scene) -> list[tuple[str, str]]:
             return rows
         rows.append(("dt", f"{dt:.4g} s{share}"))
     else:
-        for limit in limits:
+        for limit in _limits_told(scene, limits):
             rows.append((f"dt limit, {limit.term} (fibers.{limit.group})", _number(limit.dt, "s")))
         share = f" = {dt / limits[0].dt:.3g} of the limit set by {limits[0].term}"
         rows.append(("dt", f"{dt:.4g} s{share}"))
@@ -134,7 +178,10 @@ def check_lines(scene: Scene) -> list[str]:
     """The report, one line per number."""
     rows: list[tuple[str, str]] = []
     for index, group in enumerate(scene.fibers):
-        rows += _group_lines(scene, index, group)
+        if group.table is None:
+            rows += _group_lines(scene, index, group)
+    for table in dict.fromkeys(g.table for g in scene.fibers if g.table is not None):
+        rows += _table_lines(scene, table)
     rows.append(("total strain", _number(total_strain(scene))))
     rows += _step_lines(scene)
     if contact_reach(scene) > 0.0:

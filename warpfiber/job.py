@@ -27,6 +27,7 @@ from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.simulation import BoxExhausted, Diverged, Simulation, preflight, with_device
 from warpfiber.stopping import Stopper
 from warpfiber.summary import Summary, versions
+from warpfiber.trial import after_trial
 
 LOOK_EVERY = 0.2  # s of wall time between looks at stop requests and the progress line
 PROFILE_STEPS = 5
@@ -74,6 +75,7 @@ class Job:
         faults = _faults_of(preflight, scene) + _faults_of(ResultFolder.check, out, overwrite)
         if faults:
             raise SceneError(faults)
+        scene = after_trial(scene, workers)
         simulation = Simulation(scene, workers=workers)
         folder = ResultFolder.create(out, scene.name, overwrite)
         job = cls(simulation, folder, progress=progress)

@@ -21,7 +21,7 @@ from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
-from warpfiber.placement import Placement, place_fibers
+from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
@@ -92,7 +92,7 @@ def preflight(scene: Scene) -> None:
     """All faults that need no fibers: device, dt. Raises SceneError with every one of them."""
     probes: list[Callable[[Scene], object]] = [lambda scene: choose_device(scene, 0)]
     if not any(group.node_file for group in scene.fibers):
-        probes.append(check_step)
+        probes.append(lambda scene: check_step(split_tables(scene)))
     faults: list[Fault] = []
     for probe in probes:
         try:
@@ -120,7 +120,7 @@ class Simulation:
         Raises SceneError if the device does not exist, the fibers cannot be placed or dt is not
         stable.
         """
-        scene = with_device(scene, device)
+        scene = split_tables(with_device(scene, device))
         if placement is None:
             preflight(scene)
             placement = place_fibers(scene)

@@ -53,7 +53,6 @@ segments = 26
 NOT_YET: list[tuple[dict[str, object], str]] = [
     ({"numerics.contact": "unilateral"}, "numerics.contact"),
     ({"flow.kind": "field", "flow.file": "a.npz"}, "flow.kind"),
-    ({"fibers.0.count": GONE, "fibers.0.layers": "layers.csv"}, "fibers.0.layers"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible"),
     ({"fibers.0.shape": {"kind": "ring"}}, "fibers.0.shape.kind"),
     ({"contact.law": "linear", "contact.stiffness": 1}, "contact.law"),
@@ -189,14 +188,6 @@ def test_start_is_known() -> None:
     """[start] is not available, and does not go with [[fibers]] and [box]."""
     faults = faults_of(changed({"start": {"from": "results/a", "stage": "load"}}))
     assert [fault.key for fault in faults] == ["start", "fibers", "box"]
-
-
-def test_length_distribution_is_known() -> None:
-    """A length distribution is read whole and told to be not available."""
-    weibull = {"kind": "weibull", "number_average": 1e-3, "weight_average": 2e-3}
-    changes: dict[str, object] = {"fibers.0.aspect_ratio": GONE}
-    faults = faults_of(changed(changes | {"fibers.0.length_distribution": weibull}))
-    assert [fault.key for fault in faults] == ["fibers.0.length_distribution"]
 
 
 def test_bonded_spheres_scene_has_only_known_keys() -> None:

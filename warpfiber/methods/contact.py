@@ -200,6 +200,19 @@ class ImplicitContact:
             "fault": dual.fault / radius,
         }
 
+    def fiber_push(self) -> np.ndarray:
+        """(F,) sum of the sizes of the contact forces on each fiber in the last step, run units."""
+        push: np.ndarray = np.zeros(self.model.fiber_count)
+        fiber = self.model.host["segment_fiber"]
+        for rows, _ in self.solves:
+            count = int(rows.row_count.numpy()[0])
+            force = np.abs(rows.row_force.numpy()[:count].astype(float))
+            for side in (rows.row_i, rows.row_j):
+                segment = side.numpy()[:count]
+                met = segment >= 0
+                np.add.at(push, fiber[segment[met]], force[met])
+        return push
+
     def close(self) -> None:
         """Stop worker threads."""
         self.search.close()

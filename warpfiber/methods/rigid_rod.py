@@ -80,6 +80,24 @@ class RigidRod(Implicit):
         ]
         return Launch("fibers", make_rod_step(p.name), model.fiber_count, inputs, split=True)
 
+    # -- what is told -----------------------------------------------------------------------------
+
+    def contact_bending(self) -> float:
+        """Most that the contacts of the last step would bend a fiber of this rod's modulus, in L.
+
+        Their forces on a fiber added up, all where they bend most: F l/(75 k_b), with
+        k_b l = E I (scene/rigidity.py).
+        """
+        if self.contact is None:
+            return 0.0
+        push = self.contact.fiber_push()
+        share = [row["rest"] / (75.0 * max(row["bending"], 1e-30)) for row in self.model.group_rows]
+        return float((push * np.asarray(share)[self.model.host["fiber_group"]]).max())
+
+    def step_report(self) -> dict[str, float]:
+        """What every implicit method tells, and how far contact would bend these rods."""
+        return super().step_report() | {"contact_bending": self.contact_bending()}
+
 
 def turning_share(row: Mapping[str, float]) -> float:
     """mu = (1 - lambda_J)/2 of the rods of a group."""

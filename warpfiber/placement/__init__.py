@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from warpfiber.placement.packing import Placement, overlap_of, place_fibers, scene_cell
+from warpfiber.placement.parts import split_tables
 from warpfiber.placement.space import Cell
 
-__all__ = ["Placement", "place_fibers", "Cell", "scene_cell", "overlap_of"]
+__all__ = ["Placement", "place_fibers", "Cell", "scene_cell", "overlap_of", "split_tables"]

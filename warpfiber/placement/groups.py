@@ -98,6 +98,9 @@ def group_fibers(scene: Scene, cell: Cell, rng: np.random.Generator) -> list[Gro
     groups: list[GroupFibers] = []
     faults: list[Fault] = []
     for index, group in enumerate(scene.fibers):
+        if group.table is not None:  # fibers of many lengths are drawn together
+            groups.append(GroupFibers(index, cell, group.radius, segments=group.segments))
+            continue
         try:
             made = _from_file(scene, index, group, cell)
             groups.append(made or _from_statistics(scene, index, group, cell, rng))
@@ -141,7 +144,7 @@ def _from_statistics(
     """Group of straight fibers: directions as asked, centers if given."""
     asked = group.orientation
     try:
-        tensor = _asked_tensor(group)
+        tensor = asked_tensor(asked, group.direction)
     except ValueError as error:
         raise _error(scene, index, "orientation", asked, str(error)) from error
     made = GroupFibers(
@@ -158,7 +161,7 @@ def _from_statistics(
     live = axes[:, eigen > FLAT]
     made.turning = live @ live.T if live.shape[1] > 1 else np.zeros((3, 3))
     if asked == "aligned":
-        made.direction = np.tile(_aligned(group), (n, 1))
+        made.direction = np.tile(_aligned(group.direction), (n, 1))
     else:
         made.direction = match_moments(draw_directions(tensor, n, rng), tensor)
     bad = _redraw_misfits(made, rng)
@@ -198,22 +201,24 @@ def _redraw_misfits(made: GroupFibers, rng: np.random.Generator) -> Ints:
     return bad
 
 
-def _asked_tensor(group: FiberGroup) -> Floats:
-    """A (3, 3) of the key `orientation`."""
-    if group.orientation == "isotropic":
+def asked_tensor(
+    asked: str | tuple[float, ...], direction: tuple[float, float, float] | None
+) -> Floats:
+    """A (3, 3) of the keys `orientation` and `direction`; ValueError says what is wrong."""
+    if asked == "isotropic":
         return np.asarray(np.eye(3) / 3.0)
-    if group.orientation == "planar":
+    if asked == "planar":
         return np.diag([0.5, 0.5, 0.0])
-    if group.orientation == "aligned":
-        along = _aligned(group)
+    if asked == "aligned":
+        along = _aligned(direction)
         return np.outer(along, along)
-    if isinstance(group.orientation, str):
+    if isinstance(asked, str):
         raise ValueError("allowed: isotropic, planar, aligned, or six tensor components")
-    return tensor_from_values(group.orientation)
+    return tensor_from_values(asked)
 
 
-def _aligned(group: FiberGroup) -> Floats:
-    along = np.array(group.direction or (1.0, 0.0, 0.0), dtype=np.float64)
+def _aligned(direction: tuple[float, float, float] | None) -> Floats:
+    along = np.array(direction or (1.0, 0.0, 0.0), dtype=np.float64)
     return np.asarray(along / np.linalg.norm(along))
 
 

@@ -26,6 +26,8 @@ from warpfiber.placement.capsules import pair_gap as gaps_of
 from warpfiber.placement.groups import GroupFibers, group_fibers
 from warpfiber.placement.insertion import Crowd
 from warpfiber.placement.orientations import orientation_tensor, values_from_tensor
+from warpfiber.placement.parts import split_tables
+from warpfiber.placement.populations import pack, population_report, populations
 from warpfiber.placement.relaxation import Freedom, relax
 from warpfiber.placement.shapes import straight_nodes
 from warpfiber.placement.space import Cell, Inserted
@@ -69,12 +71,14 @@ def place_fibers(scene: Scene, rng: np.random.Generator | None = None) -> Placem
     """
     began = time.perf_counter()
     rng = np.random.default_rng(scene.seed) if rng is None else rng
+    scene = split_tables(scene)
     cell = scene_cell(scene)
     groups = group_fibers(scene, cell, rng)
     packing = _Packing(scene, cell, groups, rng)
     packing.insert_files()
     packing.insert_given()
     packing.insert_random()
+    packing.insert_populations()
     return packing.placement(began)
 
 
@@ -116,6 +120,7 @@ class _Packing:
         self.longest = max(halves, default=0.0)
         self.widest = max((g.radius for g in groups), default=0.0)
         self.held: list[Capsules] = []
+        self.tables: list[dict[str, Any]] = []
         self.placed = Inserted(cell, self.longest, self.widest)
 
     def _fault(self, group: int, key: str, value: object, remedy: str) -> SceneError:
@@ -220,6 +225,20 @@ class _Packing:
             g.center, g.direction = loose.center[mine], loose.direction[mine]
             g.tries += int(tries[mine].sum())
 
+    def insert_populations(self) -> None:
+        """Fibers of many lengths or in layers, all at once, bent where they are in the way."""
+        crowd = populations(self.scene, self.cell, self.rng)
+        if not crowd:
+            return
+        placed = [g.capsules() for g in self.groups if len(g.center) and g.given is None]
+        outcome, strains = pack(self.scene, self.cell, crowd, [*self.held, *placed])
+        self.sweeps += outcome.sweeps
+        self.relaxations += 1
+        for population in crowd:
+            for chain, index in zip(population.chains, population.member, strict=True):
+                self.groups[index].nodes.append(chain)
+            self.tables.append(population_report(self.scene, population, strains))
+
     def _fill(self, crowd: Crowd, placed: NDArray[np.bool_]) -> None:
         """Lists what is placed from the beginning."""
         crowd.clear()
@@ -279,7 +298,10 @@ class _Packing:
         # Fibers that do not see each other may all lie on one point: counting pairs would not end.
         overlap = overlap_of(node_pos, start, radius, self.cell) if self.apart and owner else None
         report = {
-            "groups": [_group_report(g) for g in self.groups],
+            "groups": [
+                _group_report(g) for g in self.groups if self.scene.fibers[g.index].table is None
+            ],
+            "tables": self.tables,
             "overlap": overlap,
             "inserted_overlapping": self.squeezed,
             "relaxations": self.relaxations,

@@ -20,14 +20,11 @@ class Row:
 
 
 METHOD_ADVICE = 'use method = "auto", "bead_chain", "overdamped" or "rigid_rod"'
-FIBER_ADVICE = "give several [[fibers]] groups instead"
 STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("fibers", "layers", (), FIBER_ADVICE),
-    Row("fibers", "length_distribution", (), FIBER_ADVICE),
     Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
     Row("contact", "law", ("none", "exponential", "linear"),
         'use law = "exponential", "linear" or "none"'),

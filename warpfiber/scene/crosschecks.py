@@ -225,7 +225,10 @@ def _check_positions(draft: Draft, group: Values, path: str) -> None:
 
 def _check_filling(draft: Draft) -> None:
     """All groups together fill less of the box than the densest packing of cylinders."""
-    shares = [group["volume_fraction_achieved"] or 0.0 for group in draft.fibers]
+    shares = [
+        group["volume_fraction_achieved"] or group["volume_fraction"] or 0.0
+        for group in draft.fibers
+    ]
     total = math.fsum(shares)
     if total >= HOPELESS_FRACTION:
         fullest = shares.index(max(shares))

@@ -16,7 +16,7 @@ from warpfiber.scene.faults import Fault, FaultList, SceneError, nearest
 from warpfiber.scene.keys import Reader, Table, Values, dotted, read_table
 from warpfiber.scene.overrides import COMMAND, apply_overrides
 from warpfiber.scene.resolving import resolve
-from warpfiber.scene.scene import Numerics, Record, Scene, Stage, scene_from_resolved
+from warpfiber.scene.scene import Numerics, Record, RodTrial, Scene, Stage, scene_from_resolved
 from warpfiber.scene.schema import (
     BOX,
     CONTACT,
@@ -116,17 +116,19 @@ def _scene(
     """Return the checked scene of raw tables."""
     tables, faults = apply_overrides(_mended(raw), overrides, path)
     _check_headings({**tables, **raw}, faults)
-    reason = None
+    reason, rods = None, None
     if is_auto(tables):
 
         def read(method: str) -> Draft:
             return _checked(with_method(tables, method), FaultList(path), folder)
 
-        method, reason = choose_method(read)
+        method, reason, trial = choose_method(read)
+        if trial is not None:
+            rods = RodTrial(_finished(read("rigid_rod"), path, reason), trial)
         tables = with_method(tables, method)
     draft = _checked(tables, faults, folder)
     faults.raise_if_any()
-    return _finished(draft, path, reason)
+    return _finished(draft, path, reason, rods)
 
 
 def _checked(tables: dict[str, Any], faults: FaultList, folder: Path) -> Draft:
@@ -234,7 +236,9 @@ def _check_available(reader: Reader, table: Table, path: str, raw: Mapping[str, 
         reader.faults.add(path, None, remedy)
 
 
-def _finished(draft: Draft, path: str, method_reason: str | None) -> Scene:
+def _finished(
+    draft: Draft, path: str, method_reason: str | None, rods: RodTrial | None = None
+) -> Scene:
     """Return the scene of a draft without faults."""
     assert draft.flow is None or draft.flow_object is not None
     return Scene(
@@ -255,6 +259,7 @@ def _finished(draft: Draft, path: str, method_reason: str | None) -> Scene:
         path=path,
         notes=tuple(draft.faults.notes),
         method_reason=method_reason,
+        rod_trial=rods,
     )
 
 

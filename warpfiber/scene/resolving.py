@@ -12,10 +12,11 @@ from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
+from warpfiber.scene.statistics import resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
-LENGTH_KEYS = ("aspect_ratio", "length", "centerline_length")
-COUNT_KEYS = ("count", "volume_fraction")
+LENGTH_KEYS = ("aspect_ratio", "length", "centerline_length", "length_distribution")
+COUNT_KEYS = ("count", "volume_fraction", "layers")
 SEGMENT_KEYS = ("segments", "segment_length", "reduced_beads")
 
 STRENGTH_FACTOR = 1000.0
@@ -32,6 +33,8 @@ def resolve(draft: Draft) -> None:
     """Complete all tables of the draft; faults go to its list."""
     _resolve_flow(draft)
     for index, group in enumerate(draft.fibers):
+        resolve_lengths(draft, group, f"fibers.{index}")
+        resolve_layers(draft, group, f"fibers.{index}")
         _resolve_length(draft, group, f"fibers.{index}")
         _resolve_group(draft, group, f"fibers.{index}")
         _resolve_count(draft, group, f"fibers.{index}")
@@ -59,7 +62,7 @@ def _resolve_flow(draft: Draft) -> None:
 def _resolve_length(draft: Draft, group: Values, path: str) -> None:
     """Complete aspect ratio, length and centerline length from the one that is given."""
     diameter = group["diameter"]
-    if group["node_file"] is not None:
+    if group["node_file"] is not None or group["length_distribution"] is not None:
         group.update(aspect_ratio=0.0, length=0.0, centerline_length=0.0)
         return
     if diameter is None:
@@ -121,6 +124,11 @@ def _resolve_count(draft: Draft, group: Values, path: str) -> None:
     if group["node_file"] is not None:
         group["count"] = 0
         return
+    if group["length_distribution"] is not None:
+        group["count"] = group["count"] or 0
+        if draft.box is None:
+            draft.blame(f"{path}.length_distribution", "needs a [box]; add one")
+        return
     box = draft.box
     if box is None:
         if group["volume_fraction"] is not None:
@@ -150,7 +158,8 @@ def _resolve_count(draft: Draft, group: Values, path: str) -> None:
 def _resolve_segments(draft: Draft) -> None:
     """Find the segments per fiber of each group from the number, length or beads asked for."""
     for group in draft.fibers:
-        group["segments"] = 0 if group["node_file"] is not None else None
+        varied = group["node_file"] is not None or group["length_distribution"] is not None
+        group["segments"] = 0 if varied else None
     place = draft.given("numerics", SEGMENT_KEYS)
     key = place.rpartition(".")[2]
     if draft.method == "rigid_rod" and draft.numerics[key] is None and not draft.is_given(place):
@@ -171,7 +180,7 @@ def _resolve_segments(draft: Draft) -> None:
     for index, (group, value) in enumerate(zip(draft.fibers, per_group, strict=True)):
         if group["node_file"] is not None:
             group["segments"] = value if draft.is_given("numerics.segments") else 0
-        elif group["aspect_ratio"] is not None:
+        elif group["aspect_ratio"]:
             group["segments"] = _segments(draft, group, index, place, value)
 
 

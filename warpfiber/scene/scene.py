@@ -20,6 +20,8 @@ from warpfiber.scene.tables import (
     FiberGroup,
     Flow,
     Gravity,
+    Layer,
+    LengthDistribution,
     Load,
     Shape,
     Start,
@@ -136,6 +138,8 @@ class Scene:
     """what the user should know that is not wrong, e.g. keys without effect"""
     method_reason: str | None = None
     """why `auto` chose numerics.method; None where the file names it"""
+    rod_trial: RodTrial | None = None
+    """the scene of rods, where a trial of `auto` has to tell whether contact bends them"""
 
     @property
     def name(self) -> str:
@@ -159,6 +163,8 @@ class Scene:
         """Return JSON-ready tables named as in a file, all defaults resolved, no absent keys."""
         tables: dict[str, Any] = {"resolved": True}
         for field in dataclasses.fields(self):
+            if field.name == "rod_trial":  # an open question, no part of what is simulated
+                continue
             value = _plain(getattr(self, field.name))
             if value is not None:
                 tables[_TABLE_NAMES.get(field.name, field.name)] = value
@@ -173,6 +179,15 @@ class Scene:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+@dataclass(frozen=True)
+class RodTrial:
+    """A scene with `rigid_rod`, and the bending by contact up to which it stands for fibers."""
+
+    scene: Scene
+    tolerance: float
+    """lengths of a fiber"""
+
+
 _TABLE_NAMES = {"walls": "wall", "loads": "load", "stages": "stage"}
 """Fields of `Scene` whose table has another name."""
 
@@ -181,6 +196,8 @@ _TABLE_CLASSES: dict[str, type] = {
     "flow": Flow,
     "fibers": FiberGroup,
     "shape": Shape,
+    "length_distribution": LengthDistribution,
+    "layers": Layer,
     "contact": Contact,
     "wall": Wall,
     "gravity": Gravity,
@@ -216,7 +233,7 @@ def _table_value(name: str, value: Any, path: str) -> Any:
         return tuple(_table_value(name, row, path) for row in value)
     fields = {
         "from_" if key == "from" else key: (
-            _table_value(key, item, path) if isinstance(item, dict) else _frozen(item)
+            _table_value(key, item, path) if _is_table(item) else _frozen(item)
         )
         for key, item in value.items()
     }
@@ -241,6 +258,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return value
+
+
+def _is_table(value: Any) -> bool:
+    """Tell whether a recorded value is a table or a list of tables."""
+    first = value[0] if isinstance(value, list | tuple) and value else value
+    return isinstance(first, dict)
 
 
 def _frozen(value: Any) -> Any:

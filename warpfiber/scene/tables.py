@@ -100,8 +100,44 @@ class Shape:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LengthDistribution:
+    """`length_distribution` of a fiber group: averages and limits of L, or a histogram."""
+
+    kind: str
+    """lognormal, weibull, histogram"""
+    number_average: float | None = None
+    """m; None with a histogram"""
+    weight_average: float | None = None
+    """m; None with a histogram"""
+    maximum: float
+    """m"""
+    minimum: float
+    """m"""
+    histogram: tuple[tuple[float, ...], ...] | None = None
+    """rows lower (m), upper (m), count"""
+    kunc_diameter: float | None = None
+    """m, of the column that the fibers were taken from"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One of the `layers` of a fiber group, counted from z = 0 up."""
+
+    thickness: float
+    """m"""
+    volume_fraction: float
+    orientation: str | tuple[float, ...]
+    """isotropic, planar (in xy), aligned, or a11, a22, a33, a12, a13, a23"""
+    direction: Vector | None = None
+    """unit vector, if aligned"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class FiberGroup:
-    """One `[[fibers]]`: fibers that are alike. With `node_file` count and sizes are 0."""
+    """One `[[fibers]]`: fibers that are alike. With `node_file` count and sizes are 0.
+
+    With `length_distribution` they are 0, too, until the table is split into groups of one length.
+    """
 
     diameter: float
     """m"""
@@ -127,6 +163,12 @@ class FiberGroup:
     """m, node to node"""
     segments: int
     """per fiber"""
+    length_distribution: LengthDistribution | None = None
+    layers: tuple[Layer, ...] | None = None
+    layer_mode: str | None = None
+    """span: fibers reach through layers; inside: each stays in its own"""
+    table: int | None = None
+    """number of the [[fibers]] that this group was split off from"""
     inextensible: bool = False
     frozen: bool = False
     poisson_ratio: float = 0.5
