@@ -4,9 +4,12 @@
     python tools/bench.py beads                   1000 fibers of 20 beads: bead-steps per second
     python tools/bench.py accuracy                one flexible fiber: time and error, both methods
     python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
-    python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds
+    python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds;
+                                                  with --method auto the shipped scenes as they are
+    python tools/bench.py contact [PART ...]      implicit contact: overlaps, A_xx, time over that
+                                                  of explicit steps (parts: see bench_contact.py)
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
-    --workers W, --repeats N, --dry (print, do not write)
+    --workers W, --repeats N, --method M, --dry (print, do not write)
 
 A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
 compare only within one run of this tool.
@@ -22,29 +25,22 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from bench_contact import contact_rows
 from bench_overdamped import overdamped_rows
-from machine import ROOT, commit, processor
+from bench_papers import period_rows, suspension_rows
+from machine import ROOT, SCENES, commit, processor
 
 import warpfiber as wf
 from warpfiber.methods import bead_chain
 from warpfiber.methods.stability import chosen_step
 from warpfiber.placement import Placement, place_fibers
 
-SCENES = ROOT / "scenes" / "sasayama_2018"
 RESULTS = ROOT / "tools" / "results" / "bench.jsonl"
 
 # Single flexible fiber of Fig. 5: float64 restatement by RK4 (tests/reference), z/L of the last
 # node.
 FLEXIBLE_TIP = {20: -0.015848495, 30: -0.038916905, 35: -0.122312314, 40: -0.142961750}
 PLACED_AT_ONCE = 2500  # fibers; more are periodic copies
-# Scene -> segments of the reduced chain; every cell also runs as the full chain.
-CELLS = {
-    "rigid_rf10_vf122": 3,
-    "rigid_rf10_vf201": 3,
-    "shear_cell": 3,
-    "flexible_rf20_vf056": 7,
-    "flexible_rf30_vf037": 10,
-}
 
 
 def common(simulation: wf.Simulation) -> dict[str, Any]:
@@ -110,6 +106,7 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "fibers.0.aspect_ratio": 51,
                 "fibers.0.count": fibers,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.segments": 10,
                 "numerics.precision": precision,
                 "numerics.dt_fraction": 0.5,
@@ -152,6 +149,7 @@ def beads(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "fibers.0.aspect_ratio": 20,
                 "fibers.0.count": 1000,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.reduced_beads": 0,
                 "numerics.precision": precision,
                 "record.quantities": ["overlap"],
@@ -247,105 +245,27 @@ def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def period(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Fig. 3: 2 t_1 of a rigid fiber, corrected and not, against the full chain."""
-    full: float | None = None
-    for closure in ("paper", "consistent", "none"):
-        for segments in (99, 33, 11, 9, 3, 1) if closure == "paper" else (33, 11, 9, 3, 1):
-            scene = wf.load_scene(
-                SCENES / "period.toml",
-                {"numerics.segments": segments, "numerics.closure": closure},
-            )
-            simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
-            simulation.step(1)
-            begin = time.perf_counter()
-            value = 2.0 * half_turn(simulation) / scene.flow.rate
-            seconds = time.perf_counter() - begin
-            full = value if full is None else full
-            steps = simulation.step_count
-            yield common(simulation) | {
-                "bench": "period",
-                "period": value,
-                "seconds": round(seconds, 2),
-                "steps": steps,
-                "ns_per_segment_step": round(seconds / steps / segments * 1e9, 1),
-                "error": value / full - 1.0,
-                "error_kind": "relative to the full chain (99 segments)",
-            }
-            simulation.close()
-
-
-def half_turn(simulation: wf.Simulation, limit: float = 1000.0, every: float = 0.2) -> float:
-    """Strain at which the end-to-end vector of fiber 0 passes -x, by cubic interpolation."""
-    strains, angles = [0.0], [0.0]
-    last = simulation.fiber_node_start[1] - 1
-    while strains[-1] < limit:
-        simulation.run(until=simulation.strain + every)
-        nodes = simulation.node_pos
-        axis = nodes[last] - nodes[0]
-        angle = np.arctan2(axis[2], axis[0])
-        step = (angle - angles[-1] + np.pi) % (2.0 * np.pi) - np.pi
-        strains.append(simulation.strain)
-        angles.append(angles[-1] + step)
-        if len(angles) > 4 and angles[-3] < -np.pi:
-            # inverse interpolation through the four samples around the passage
-            x, y = np.array(angles[-5:-1]) + np.pi, np.array(strains[-5:-1])
-            return float(np.polyval(np.polyfit(x, y - y[0], 3), 0.0) + y[0])
-    raise RuntimeError("the fiber did not turn")
+    """Fig. 3 (`bench_papers`)."""
+    yield from period_rows(args, common)
 
 
 def suspensions(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Cells of Figs. 6-9: A and interactions over the second half of the strain, per seed."""
-    for name in args.names or CELLS:
-        for seed in range(1, args.seeds + 1):
-            for segments in args.segments or (CELLS[name], 0):
-                key = "segments" if segments else "reduced_beads"
-                overrides = {"seed": seed, f"numerics.{key}": segments} | dict(args.set)
-                scene = wf.load_scene(SCENES / f"{name}.toml", overrides)
-                yield suspension(scene, args)
+    """Figs. 6-9 (`bench_papers`)."""
+    yield from suspension_rows(args, common)
 
 
-def suspension(scene: wf.Scene, args: argparse.Namespace) -> dict[str, Any]:
-    """One run: means over the second half of the strain."""
-    simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
-    simulation.prepare()
-    begin = time.perf_counter()
-    rows: list[dict[str, float]] = []
-    for strain in np.linspace(0.0, args.strain, 301):
-        simulation.run(until=float(strain))
-        rows.append(simulation.measure())
-    seconds = time.perf_counter() - begin
-    late = rows[len(rows) // 2 :]
-    mean = {k: float(np.mean([row[k] for row in late])) for k in late[0] if k != "step"}
-    steps = simulation.step_count
-    simulation.close()
-    return common(simulation) | {
-        "bench": "suspension",
-        "seed": scene.seed,
-        "strain": args.strain,
-        "lubrication_step": scene.numerics.lubrication_step,
-        "lubrication": scene.contact.lubrication,
-        "seconds": round(seconds, 1),
-        "steps": steps,
-        "ns_per_segment_step": round(seconds / steps / simulation.model.segment_count * 1e9, 1),
-        "a11": round(mean["a11"], 5),
-        "a22": round(mean["a22"], 5),
-        "a33": round(mean["a33"], 5),
-        "a11_end": round(rows[-1]["a11"], 5),
-        "interactions_per_fiber": round(mean["interactions_per_fiber"], 4),
-        "contacts_per_fiber": round(mean["contacts_per_fiber"], 4),
-        "overlap_max": round(max(row["overlap_max"] for row in rows), 4),
-        "curve_strain": [round(row["strain"], 2) for row in rows[::10]],
-        "curve_a11": [round(row["a11"], 4) for row in rows[::10]],
-        "error": max(row["axial_strain_max"] for row in rows),
-        "error_kind": "largest axial strain",
-    }
+def contact(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Implicit contact (`bench_contact`)."""
+    yield from contact_rows(args, common)
 
 
 def main() -> None:
     """Run one benchmark and append its rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("bench", choices=["engine", "beads", "accuracy", "period", "suspensions"])
-    parser.add_argument("names", nargs="*", help="cells of `suspensions`")
+    benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact"]
+    parser.add_argument("bench", choices=benches)
+    parser.add_argument("names", nargs="*", help="cells of `suspensions`, parts of `contact`")
+    parser.add_argument("--method", default="bead_chain", help="of `suspensions`")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--strain", type=float, default=60.0)
     parser.add_argument("--segments", type=int, nargs="*", help="0 = full chain")
@@ -353,6 +273,8 @@ def main() -> None:
     parser.add_argument("--strain-step", type=float, default=1e-3, help="of `engine`")
     parser.add_argument("--plain", action="store_true", help="on the CPU what CUDA runs")
     parser.add_argument("--precisions", nargs="*", default=["float64", "float32"])
+    parser.add_argument("--cell-fibers", type=int, default=1000, help="of `contact`")
+    parser.add_argument("--explicit", type=float, default=2.0, help="strain, of `contact`")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=7)

@@ -43,6 +43,7 @@ from warpfiber.passes.chain_response import make_chain_apply, make_chain_respons
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.held_nodes import make_carry_fibers
@@ -239,8 +240,11 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     yield from _dual_kernels(precision)
+    for name, kernel in make_contact_verdict().items():
+        yield name, "", kernel
     for variant, adaptive in (("plain", False), ("tolerance", True)):
         yield "step_end", variant, make_step_end(precision, True, adaptive)
+        yield "step_end", f"{variant} contact", make_step_end(precision, True, adaptive, True)
     for variant, nodes in _node_variants():
         yield "node_sweep", variant, make_node_sweep(precision, nodes)
     for variant, pairs in _pair_variants():

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
+SCENES = ROOT / "scenes" / "sasayama_2018"
 
 
 def commit() -> str:

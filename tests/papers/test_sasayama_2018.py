@@ -37,7 +37,11 @@ def half_turn(simulation: wf.Simulation) -> float:
 
 def period(segments: int, closure: str) -> float:
     """Period of the shipped scene in strain, 2 t_1."""
-    overrides = {"numerics.segments": segments, "numerics.closure": closure}
+    overrides = {
+        "numerics.method": "bead_chain",
+        "numerics.segments": segments,
+        "numerics.closure": closure,
+    }
     simulation = wf.Simulation(wf.load_scene(SCENES / "period.toml", overrides))
     value = 2.0 * half_turn(simulation)
     simulation.close()
@@ -74,6 +78,7 @@ def test_uncorrected_period(segments: int, full_period: float) -> None:
 def tip_curve(segments: int, closure: str, fraction: float, strains: np.ndarray) -> np.ndarray:
     """x/L, z/L of the last node of the shipped flexible fiber at the given strains, (K, 2)."""
     overrides = {
+        "numerics.method": "bead_chain",
         "numerics.segments": segments,
         "numerics.closure": closure,
         "numerics.dt_fraction": fraction,

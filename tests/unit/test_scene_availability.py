@@ -84,12 +84,30 @@ OVERDAMPED: dict[str, object] = {
     "fibers.0.density": GONE,
 }
 
+RODS = OVERDAMPED | {"numerics.method": "rigid_rod", "numerics.segments": GONE}
+
+CONTACT_FAULTS: list[tuple[dict[str, object], str, str]] = [
+    ({"box.boundary": ["periodic", "wall", "wall"]}, "contact.law", "walls push by contact"),
+    ({"contact.law": "linear"}, "contact.stiffness", "missing"),
+    ({"contact.law": "linear", "contact.stiffness": 0}, "contact.stiffness", "a number > 0"),
+    ({"contact.friction": 0.3}, "contact.friction", "contacts are frictionless"),
+    ({"contact.lubrication": "paper"}, "contact.lubrication", "switches off all pairs"),
+    ({"numerics.contact_tolerance": 0}, "numerics.contact_tolerance", "a number > 0"),
+    ({"numerics.contact_tolerance": -1e-3}, "numerics.contact_tolerance", "a number > 0"),
+    ({"numerics.linearizations": 0}, "numerics.linearizations", ">= 1 and < 3"),
+    ({"numerics.linearizations": 3}, "numerics.linearizations", ">= 1 and < 3"),
+    ({"numerics.contact": "hard"}, "numerics.contact", "unilateral"),
+]
+
 NOT_OVERDAMPED: list[tuple[dict[str, object], str, str]] = [
-    ({"contact": GONE}, "contact.law", "the default is not available"),
-    ({"contact.law": "exponential"}, "contact.law", 'use "none", or method = "bead_chain"'),
-    ({"box.boundary": ["periodic", "wall", "wall"]}, "box.boundary", "wall is not available"),
+    *CONTACT_FAULTS,
     ({"numerics.closure": "paper"}, "numerics.closure", 'use closure = "consistent"'),
     ({"numerics.integrator": "bdf2", "numerics.tolerance": 1e-3}, "numerics.tolerance", "sdirk2"),
+    (
+        {"contact.law": "exponential", "numerics.integrator": "bdf2"},
+        "numerics.integrator",
+        'contact needs a method of one step; use "sdirk2"',
+    ),
     (
         {"flow.kind": "rest", "stage.0.end_time": 1, "numerics.tolerance": 0.1},
         "numerics.tolerance",
@@ -100,7 +118,7 @@ NOT_OVERDAMPED: list[tuple[dict[str, object], str, str]] = [
 ]
 
 
-def test_overdamped_without_pairs_and_walls() -> None:
+def test_overdamped_loads() -> None:
     """The scene that the cases below change loads, with a list of words left to the method."""
     scene = scene_from_dict(changed(OVERDAMPED))
     assert scene.numerics.integrator == "sdirk2"
@@ -109,19 +127,39 @@ def test_overdamped_without_pairs_and_walls() -> None:
     assert free.fibers[0].inextensible
 
 
+@pytest.mark.parametrize("method", ["overdamped", "rigid_rod"])
+@pytest.mark.parametrize(
+    "contact",
+    [
+        {},
+        {"law": "exponential"},
+        {"law": "linear", "stiffness": 1.0},
+        {"lubrication": "paper"},
+        {"lubrication": "shifted"},
+    ],
+)
+def test_contact_and_walls_load(method: str, contact: dict[str, object]) -> None:
+    """Fibers that meet one another and walls; they overlap only if a penalty is asked for."""
+    given = OVERDAMPED if method == "overdamped" else RODS
+    tables = changed(given | {"box.boundary": ["periodic", "wall", "wall"]})
+    tables["contact"] = contact
+    assert scene_from_dict(tables).numerics.contact == "unilateral"
+    tables["numerics"] |= {"contact": "penalty", "linearizations": 2, "contact_tolerance": 1e-4}
+    scene = scene_from_dict(tables)
+    assert scene.numerics.contact == "penalty"
+    assert scene.numerics.linearizations == 2 and scene.numerics.contact_tolerance == 1e-4
+
+
 @pytest.mark.parametrize(("changes", "key", "advice"), NOT_OVERDAMPED)
 def test_what_overdamped_cannot_run(changes: dict[str, object], key: str, advice: str) -> None:
-    """Pairs, walls and other closures are refused with what to do instead."""
+    """Other closures, and what does not go with contact, are refused with what to do instead."""
     faults = faults_of(changed(OVERDAMPED | changes))
     assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
     assert advice in faults[0].remedy
 
 
-RODS = OVERDAMPED | {"numerics.method": "rigid_rod", "numerics.segments": GONE}
 NOT_RODS: list[tuple[dict[str, object], str, str]] = [
-    ({"contact": GONE}, "contact.law", "the default is not available"),
-    ({"contact.law": "exponential"}, "contact.law", "rods do not meet"),
-    ({"box.boundary": ["periodic", "wall", "wall"]}, "box.boundary", "wall is not available"),
+    *CONTACT_FAULTS,
     ({"numerics.closure": "paper"}, "numerics.closure", 'use closure = "consistent"'),
     ({"numerics.segments": 3}, "numerics.segments", "a rod is one segment"),
     ({"numerics.reduced_beads": 4}, "numerics.reduced_beads", "a rod is one segment"),
@@ -205,5 +243,5 @@ def test_start_is_known() -> None:
 def test_bonded_spheres_scene_has_only_known_keys() -> None:
     """A scene of a later version is refused for that reason alone."""
     faults = faults_of(tomllib.loads(BONDED_SPHERES))
-    assert len(faults) == 6
+    assert len(faults) == 5
     assert all("not available in this version" in fault.remedy for fault in faults)

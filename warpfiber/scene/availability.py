@@ -24,7 +24,6 @@ STAGE_ADVICE = 'only kind = "flow" and "settle" run; end it by end_strain, end_t
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
     Row("stage", "kind", ("flow", "settle"), STAGE_ADVICE),
     Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
     Row("stage", "end_pressure", (), STAGE_ADVICE),
@@ -40,6 +39,10 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 )  # fmt: skip
 
 
+STRAIGHT = Row("shape", "kind", ("straight",),
+               'fibers of this method are straight at rest; use kind = "straight", '
+               "or node_file to start from another form")  # fmt: skip
+
 FLOWING = (
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
@@ -52,6 +55,7 @@ SOFT = Row("contact", "law", ("none", "exponential", "linear"),
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         *FLOWING,
+        STRAIGHT,
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
         Row("contact", "law", ("none", "exponential"),
@@ -62,11 +66,13 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "overdamped": (
         *FLOWING,
         SOFT,
+        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
         *FLOWING,
         SOFT,
+        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (
