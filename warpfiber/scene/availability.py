@@ -42,8 +42,8 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 STRAIGHT = Row("shape", "kind", ("straight",),
                'fibers of this method are straight at rest; use kind = "straight", '
                "or node_file to start from another form")  # fmt: skip
-
 FLOWING = (
+    STRAIGHT,
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
@@ -55,7 +55,6 @@ SOFT = Row("contact", "law", ("none", "exponential", "linear"),
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         *FLOWING,
-        STRAIGHT,
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
         Row("contact", "law", ("none", "exponential"),
@@ -66,13 +65,11 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "overdamped": (
         *FLOWING,
         SOFT,
-        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
         *FLOWING,
         SOFT,
-        STRAIGHT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (
