@@ -101,12 +101,12 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             fibers = tiles**3 * round(fibers / tiles**3)
             edge = (2.0 * np.pi * 5e-6**3 * 50 * fibers / 0.1) ** (1 / 3)
             overrides = {
-                "numerics.method": "bead_chain",
                 "box.size": [edge] * 3,
                 "box.boundary": ["periodic"] * 3,
                 "fibers.0.aspect_ratio": 51,
                 "fibers.0.count": fibers,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.segments": 10,
                 "numerics.precision": precision,
                 "numerics.dt_fraction": 0.5,
@@ -144,12 +144,12 @@ def beads(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         scene = wf.load_scene(
             SCENES / "shear_cell.toml",
             {
-                "numerics.method": "bead_chain",
                 "box.size": [edge] * 3,
                 "box.boundary": ["periodic"] * 3,
                 "fibers.0.aspect_ratio": 20,
                 "fibers.0.count": 1000,
                 "contact.lubrication": "none",
+                "numerics.method": "bead_chain",
                 "numerics.reduced_beads": 0,
                 "numerics.precision": precision,
                 "record.quantities": ["overlap"],

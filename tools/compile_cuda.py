@@ -29,12 +29,21 @@ from typing import Any
 import warp as wp
 
 from warpfiber.laws.contact_compliance import LAWS
+from warpfiber.passes.bond_drift import make_bond_drift
+from warpfiber.passes.bond_energy import make_measure_bonds
+from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
+from warpfiber.passes.capsule_pairs import (
+    CapsuleFeatures,
+    make_capsule_pairs,
+    make_carry_memory,
+)
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
 from warpfiber.passes.chain_response import make_chain_apply, make_chain_response
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.held_nodes import make_carry_fibers
@@ -63,6 +72,8 @@ ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
 # Kernels that may have a stack frame: name of the kernel, largest frame in bytes, and why.
 FRAMES: dict[str, tuple[int, str]] = {
+    "bond_sweep": (40, "sine and cosine, of nodes that turn by more than 0.2 in a step"),
+    "bond_drift": (40, "as bond_sweep"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
 }
 
@@ -174,6 +185,22 @@ def _pair_variants() -> list[tuple[str, PairFeatures]]:
     ]
 
 
+def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
+    """(variant, features, (drifts, kicks)) of the sweep over bonded spheres."""
+    floor = (False, False, True)
+    bed = BondFeatures(dashpots=True, walls=floor, pairs=True, wall_friction=True)
+    return [
+        ("alone", BondFeatures(), (True, True)),
+        (
+            "held rings",
+            BondFeatures(dashpots=True, walls=floor, loads=True, closed=True),
+            (True, True),
+        ),
+        ("bed", bed, (False, True)),
+        ("start of a bed", bed, (False, False)),
+    ]
+
+
 def _dual_kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     for law in LAWS:
         yield "dual_begin", law, make_dual_begin(precision, law, False)
@@ -202,11 +229,22 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "carry_fibers", "", make_carry_fibers(precision, True, CHI)
     yield "rod_maps", "", make_rod_maps(precision)
     yield "rod_step", "", make_rod_step(precision)
+    for variant, bonds, parts in _bond_variants():
+        yield "bond_sweep", variant, make_bond_sweep(precision, bonds, *parts)
+    yield "bond_drift", "", make_bond_drift(precision)
+    yield "capsule_pairs", "plain", make_capsule_pairs(precision, CapsuleFeatures())
+    rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
+    yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
+    yield "carry_memory", "", make_carry_memory(precision)
+    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     yield from _dual_kernels(precision)
+    for name, kernel in make_contact_verdict().items():
+        yield name, "", kernel
     for variant, adaptive in (("plain", False), ("tolerance", True)):
         yield "step_end", variant, make_step_end(precision, True, adaptive)
+        yield "step_end", f"{variant} contact", make_step_end(precision, True, adaptive, True)
     for variant, nodes in _node_variants():
         yield "node_sweep", variant, make_node_sweep(precision, nodes)
     for variant, pairs in _pair_variants():

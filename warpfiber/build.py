@@ -1,7 +1,8 @@
 """Scene -> (Model, State): place the fibers, choose the run's units, allocate on the device.
 
 Units: length = radius of the first group, time = 1 / rate of the flow (without a rate: the time in
-which drag stops a bead), force = eta rate a^2 (without a flow: m a / time^2).
+which drag stops a bead; without a fluid: in which sound passes a radius), force = eta rate a^2
+(without a fluid: m a / time^2).
 """
 
 from __future__ import annotations
@@ -36,8 +37,10 @@ def choose_units(scene: Scene) -> Units:
     mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 1.0)
     eta = scene.flow.viscosity if scene.flow else 0.0
     rate = scene.flow.rate if scene.flow else 0.0
-    if rate == 0.0:
-        rate = 6.0 * math.pi * eta * a / mass if eta > 0.0 else 1.0
+    if rate == 0.0 and eta > 0.0:
+        rate = 6.0 * math.pi * eta * a / mass
+    elif rate == 0.0:
+        rate = math.sqrt(group.youngs_modulus / (group.density or 1.0)) / a
     force = eta * rate * a * a if eta > 0.0 else mass * a * rate * rate
     return Units(length=a, time=1.0 / rate, force=force)
 

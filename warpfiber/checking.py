@@ -12,6 +12,7 @@ from warpfiber.methods.skin import START_SKIN
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.methods.strain_steps import LARGEST_STRAIN
 from warpfiber.passes.neighbors import FIRST_STRETCH
+from warpfiber.placement import shape_feret
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import (
     bead_count,
@@ -93,6 +94,9 @@ def _group_lines(scene: Scene, index: int, group: FiberGroup) -> list[tuple[str,
     if group.volume_fraction is not None:
         name, value = rows[2]
         rows[2] = (name, f"{value} ({group.volume_fraction:.4g})")
+    if group.shape.kind != "straight" and group.node_file is None:
+        span = shape_feret(scene, index) / group.centerline_length
+        rows.append(("maximum Feret diameter / centerline", _number(span)))
     if scene.box is not None:
         edges = " x ".join(f"{group.length / edge:.3g}" for edge in scene.box.size)
         rows.append(("fiber length / box edges", edges))

@@ -113,6 +113,8 @@ class Job:
         job.summary.restore(attrs["last_row"], attrs["half_turns"])
         job.stage_index = int(attrs["stage_index"])
         job.stage_start = (float(attrs["stage_strain"]), float(attrs["stage_time"]))
+        if job.stage_index < len(job.stages):
+            simulation.begin_stage(job.stages[job.stage_index], resumed=True)
         job.row_index, job.frame_index = int(attrs["row_index"]), int(attrs["frame_index"])
         job.summary.wall_before = float(attrs["wall_seconds"])
         frame_step = int(attrs["frame_step"])
@@ -214,7 +216,8 @@ class Job:
         frame = self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
         steps_to = self.simulation.steps_to
         end = self.simulation.stage_steps(stage, self.stage_start)
-        return [end, steps_to(*row), steps_to(*frame)]
+        limit = self.simulation.steps_to_limit(stage, self.stage_start)
+        return [min(end, max(1, limit)), steps_to(*row), steps_to(*frame)]
 
     def _event_mark(
         self, stage: Stage, index: int, interval: tuple[str, float]
@@ -241,22 +244,26 @@ class Job:
         if stage.end_strain is not None and flow is not None and flow.rate > 0.0:
             ends = [s.end_strain for s in self.stages]
             return "strain", sum(e for e in ends if e is not None) / count
-        times = [s.end_time for s in self.stages]
+        times = [s.end_time or s.time_limit for s in self.stages]
         return "time", sum(t for t in times if t is not None) / count
 
     def _end_stage(self, stage: Stage) -> None:
-        self.folder.log(f"stage '{stage.name}' ended at strain {self.simulation.strain:.6g}")
+        strain, seconds = self.simulation.strain, self.simulation.time
+        where = f"strain {strain:.6g}" if self.scene.flow else f"time {seconds:.6g} s"
+        self.folder.log(f"stage '{stage.name}' ended at {where}")
         self.stage_index += 1
         self.stage_start = (self.simulation.strain, self.simulation.time)
         self.row_index = self.frame_index = 0
         if self.stage_index < len(self.stages):
+            self.simulation.begin_stage(self.stages[self.stage_index])
             self._write_checkpoint(self.simulation.snapshot(), self._position())
 
     def _past_time_limit(self, stage: Stage) -> bool:
-        limit = stage.time_limit
-        if limit is None or self.simulation.time - self.stage_start[1] < limit:
+        if self.simulation.steps_to_limit(stage, self.stage_start) > 0:
             return False
-        message = f"stage '{stage.name}': end condition not met within {limit:g} s"
+        if self.simulation.stage_steps(stage, self.stage_start) <= 0:
+            return False
+        message = self.simulation.unmet(stage)
         self.folder.log(message)
         self.summary.failure = {"outcome": "end condition not met", "message": message}
         return True

@@ -54,14 +54,19 @@ class Precision:
     real: Any
     vec2: Any
     vec3: Any
+    vec4: Any
     mat33: Any
     numpy: Any
     eps: float
 
 
 _PRECISIONS = {
-    "float32": Precision("float32", wp.float32, wp.vec2f, wp.vec3f, wp.mat33f, np.float32, 1e-6),
-    "float64": Precision("float64", wp.float64, wp.vec2d, wp.vec3d, wp.mat33d, np.float64, 1e-12),
+    "float32": Precision(
+        "float32", wp.float32, wp.vec2f, wp.vec3f, wp.vec4f, wp.mat33f, np.float32, 1e-6
+    ),
+    "float64": Precision(
+        "float64", wp.float64, wp.vec2d, wp.vec3d, wp.vec4d, wp.mat33d, np.float64, 1e-12
+    ),
 }
 
 

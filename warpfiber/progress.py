@@ -28,7 +28,7 @@ def _goal(job: Any) -> tuple[str, float, float]:
     ends = [stage.end_strain for stage in stages]
     if all(end is not None for end in ends):
         return "strain", job.simulation.strain, float(sum(ends))
-    times = [stage.end_time or 0.0 for stage in stages]
+    times = [stage.end_time or stage.time_limit or 0.0 for stage in stages]
     return "time", job.simulation.time, float(sum(times))
 
 

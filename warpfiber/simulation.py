@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ import warp as wp
 
 from warpfiber.build import build, realized_scene
 from warpfiber.methods.bead_chain import BeadChain
+from warpfiber.methods.bonded_spheres import BondedSpheres
 from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.rigid_rod import RigidRod
@@ -30,6 +32,7 @@ METHODS: dict[str, type[Method]] = {
     "bead_chain": BeadChain,
     "overdamped": Overdamped,
     "rigid_rod": RigidRod,
+    "bonded_spheres": BondedSpheres,
 }
 
 # What a checkpoint holds beside what the method saves: arrays that the next step depends on.
@@ -44,6 +47,10 @@ class Diverged(Exception):
     def __init__(self, report: Mapping[str, Any]) -> None:
         self.report = dict(report)
         super().__init__(report["message"])
+
+
+class StageUnfinished(Exception):
+    """A stage has not met its end condition within its time limit."""
 
 
 class BoxExhausted(Exception):
@@ -133,15 +140,19 @@ class Simulation:
         wanted = workers if workers is not None else scene.numerics.workers
         method = METHODS[self.scene.numerics.method]
         self.method = method(self.scene, self.model, self.state, self.dt, wanted)
+        quantities = self.scene.record.quantities
+        if method.own_energy:
+            quantities = tuple(name for name in quantities if name != "energy")
         self.measurement = Measurement(
             self.model,
             self.state,
-            self.scene.record.quantities,
+            quantities,
             self.method.pair_features,
             self.method.strength,
             self.method.decay,
             self.method.inertia,
         )
+        self.begin_stage(self.scene.stage_sequence[0])
 
     # -- stepping ---------------------------------------------------------------------------------
 
@@ -178,21 +189,49 @@ class Simulation:
             return
         start = (0.0, 0.0)
         for stage in self.scene.stage_sequence:
+            self.begin_stage(stage)
             while (steps := self.stage_steps(stage, start)) > 0:
-                self.step(steps)
+                left = self.steps_to_limit(stage, start)
+                if left <= 0:
+                    raise StageUnfinished(self.unmet(stage))
+                self.step(min(steps, left))
+            # what ended by another condition ends where it is
+            ended = stage.end_time is not None and (
+                self.steps_to(None, start[1] + stage.end_time) <= 0
+            )
             start = (
                 self.strain if stage.end_strain is None else start[0] + stage.end_strain,
-                self.time if stage.end_time is None else start[1] + stage.end_time,
+                start[1] + stage.end_time if ended and stage.end_time else self.time,
             )
+
+    def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
+        """Take over what a stage changes; `resumed`: it began before the state was saved."""
+        self.method.begin_stage(stage, resumed=resumed)
 
     def stage_steps(self, stage: Stage, start: tuple[float, float]) -> int:
         """Steps that surely do not pass the end of a stage begun at `start` = (strain, time)."""
         flow = self.scene.flow  # a fluid at rest never reaches a strain
         moving = flow is not None and flow.rate > 0.0
-        return self.steps_to(
+        marks = (
             start[0] + stage.end_strain if moving and stage.end_strain is not None else None,
             start[1] + stage.end_time if stage.end_time is not None else None,
         )
+        own = self.method.steps_left(stage)
+        if own is None:
+            return self.steps_to(*marks)
+        return own if marks == (None, None) else min(own, self.steps_to(*marks))
+
+    def steps_to_limit(self, stage: Stage, start: tuple[float, float]) -> int:
+        """Steps that surely do not pass the time limit of such a stage; many without one."""
+        if stage.time_limit is None:
+            return sys.maxsize
+        return self.steps_to(None, start[1] + stage.time_limit)
+
+    def unmet(self, stage: Stage) -> str:
+        """That a stage did not end within its time limit, and what it waits for."""
+        condition = self.method.unmet(stage)
+        message = f"stage '{stage.name}': end condition not met within {stage.time_limit:g} s"
+        return f"{message}: {condition}" if condition else message
 
     def steps_to(self, strain: float | None, time: float | None) -> int:
         """Steps that surely do not pass the first of the two marks; 0 if one is reached."""
@@ -276,7 +315,7 @@ class Simulation:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
         self.prepare()
         row = {"step": self.step_count, "time": self.time, "strain": self.strain}
-        return row | self.measurement.row(self.method.list)
+        return row | self.measurement.row(self.method.list) | self.method.measure()
 
     # -- saving -----------------------------------------------------------------------------------
 

@@ -17,10 +17,10 @@ SCENES = Path(__file__).resolve().parents[2] / "scenes" / "sasayama_2018"
 pytestmark = pytest.mark.slow
 
 
-def late_orientation(name: str, seed: int, **numerics: float) -> tuple[float, float]:
+def late_orientation(name: str, seed: int, **numerics: object) -> tuple[float, float]:
     """Mean A_xx and interactions per fiber over strain 30-60 by the published scheme."""
-    overrides = {f"numerics.{key}": value for key, value in numerics.items()} | {"seed": seed}
-    overrides |= {"numerics.method": "bead_chain"}
+    overrides = {f"numerics.{key}": value for key, value in numerics.items()}
+    overrides |= {"seed": seed, "numerics.method": "bead_chain"}
     simulation = wf.Simulation(wf.load_scene(SCENES / f"{name}.toml", overrides))
     rows = []
     for strain in np.arange(30.0, 60.1, 0.5):

@@ -89,7 +89,9 @@ def test_a_kernel_without_cubin_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_every_pass_is_compiled_in_both_precisions() -> None:
     from warpfiber.passes.cells import ListFeatures, make_cell_kernels
+    from warpfiber.passes.chain_blocks import make_end_kernels
     from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
+    from warpfiber.passes.contact_verdict import make_contact_verdict
     from warpfiber.passes.list_bound import make_list_bound
     from warpfiber.passes.row_count import RowFeatures, make_row_count
     from warpfiber.passes.rows import make_row_kernels
@@ -100,12 +102,16 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *make_row_count("float32", RowFeatures()),
         *make_check_sweeps("float32", CheckFeatures()),
         *make_list_bound("float32"),
+        *make_contact_verdict(),
+        *make_end_kernels("float32"),
+        *("fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
+        *("rod_response rod_apply chain_moves chain_response chain_apply".split()),
     }
     names = {kernel for kernel, _, _ in tool.kernels("float32")}
     assert names == {
         *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
         *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
-        *("rod_maps rod_step fill_rows".split()),
+        *("rod_maps rod_step".split()),
         *listed,
         *contact,
     }

@@ -345,18 +345,18 @@ def test_apply(start: Start) -> None:
 
 
 def test_fibers_whose_block_has_no_room(start: Start) -> None:
-    """Some or all fibers solved in every update: the same but for rounding."""
+    """Blocks by vectors or columns, some or all fibers without: the same but for rounding."""
     cell = crowd(start, dense=False)
     found = []
-    for share in (32, 6, 0):
+    for share, native in ((48, True), (48, False), (6, True), (0, True)):
         method = cell.chains.sim.method
         cell.chains.response = ChainResponse(
-            cell.chains.sim.model, method.rows, method.row_stride, method.tension, share
+            cell.chains.sim.model, method.rows, method.row_stride, method.tension, share, native
         )
         found.append(cell.chains.solve(cell.rows, most=6, tolerance=0.0))
         direct = (cell.chains.response.block_start.numpy() < 0).sum()
         fibers = int((np.diff(cell.chains.response.end_start.numpy()) > 0).sum())
-        assert direct == {32: 0, 0: fibers}.get(share, direct)
+        assert direct == {48: 0, 0: fibers}.get(share, direct)
         assert share != 6 or 0 < direct < fibers
     for other in found[1:]:
         assert np.abs(other.force - found[0].force).max() < 1e-9 * found[0].force.max()

@@ -1,9 +1,9 @@
 """Drag of a rigid rod of touching beads, and how easily a point of it moves.
 
-Source: bead drag 6 pi eta a and bead torque 8 pi eta a^3 summed along a rigid line of N beads:
-    xi = 6 pi eta a N,  K_r = 2 pi eta a^3 N (N^2 + 3).
+Source: bead drag 6 pi eta a summed along a rigid line of N beads, bead torque 8 pi eta a^3 over w
+    of them: xi = 6 pi eta a N,  K_r = 2 pi eta a^3 (N (N^2 - 1) + 4 w).
 Symbols: bead drag zeta = 6 pi eta a, bead torque 8 pi eta a^3; p direction of the rod, n unit
-    force, s arc position from the middle.
+    force, s arc position from the middle; w = N, or N - 1 with plain weights.
 """
 
 from functools import cache
@@ -15,17 +15,19 @@ from warpfiber.model import precision
 
 @cache
 def make_rod_mobility(name):
-    """`turning_drag(torque, N)` = K_r; `point_mobility(zeta, torque, N, s, p.n)`: speed along n."""
+    """`turning_drag(torque, N, w)` = K_r; `point_mobility(zeta, torque, N, w, s, p.n)`: speed."""
     real = precision(name).real
-    one, three, quarter = real(1.0), real(3.0), real(0.25)
+    one, quarter = real(1.0), real(0.25)
 
     @wp.func
-    def turning_drag(torque: real, beads: real) -> real:
-        return quarter * torque * beads * (beads * beads + three)
+    def turning_drag(torque: real, beads: real, weight: real) -> real:
+        return torque * (quarter * beads * (beads * beads - one) + weight)
 
     @wp.func
-    def point_mobility(drag: real, torque: real, beads: real, arc: real, along: real) -> real:
-        turning = turning_drag(torque, beads)
+    def point_mobility(
+        drag: real, torque: real, beads: real, weight: real, arc: real, along: real
+    ) -> real:
+        turning = turning_drag(torque, beads, weight)
         return one / (drag * beads) + arc * arc * (one - along * along) / turning
 
     return turning_drag, point_mobility

@@ -63,7 +63,7 @@ class Implicit(Method):
 
     def _make_contact(self, response: MovingResponse) -> None:
         """Contact, once the arrays of the method exist."""
-        if not self.meets or self.model.segment_count < 2:
+        if not self.meets:
             return
         scene, model = self.scene, self.model
         frozen = np.asarray([group.frozen for group in scene.fibers])[model.host["fiber_group"]]

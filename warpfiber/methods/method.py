@@ -23,7 +23,7 @@ from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pairs import PairFeatures
-from warpfiber.scene import Scene
+from warpfiber.scene import Scene, Stage
 
 # Below this many segments the hand-off between workers costs more than it saves.
 WORKER_BREAK_EVEN = 5000
@@ -33,6 +33,7 @@ class Method(ABC):
     """Advances a State by steps of `dt` (run units)."""
 
     inertia = True  # nodes have a mass, and so a kinetic energy
+    own_energy = False  # `measure` has the energies: they are not those of a chain
 
     def __init__(
         self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
@@ -152,7 +153,24 @@ class Method(ABC):
             self.executor.close()
             self.executor = None
 
+    # -- stages -----------------------------------------------------------------------------------
+
+    def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:  # noqa: B027
+        """Take over what a stage changes, if anything; `resumed`: it began before a restart."""
+
+    def steps_left(self, stage: Stage) -> int | None:
+        """Steps before which the method's own condition surely does not end it; None without."""
+        return None
+
+    def unmet(self, stage: Stage) -> str:
+        """What that condition still waits for."""
+        return ""
+
     # -- what is saved and told -------------------------------------------------------------------
+
+    def measure(self) -> dict[str, float]:
+        """Columns of the record beside those that all methods have, SI."""
+        return {}
 
     @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:

@@ -1,14 +1,13 @@
 """Rigid straight rods without inertia: exact maps of a linear flow, no unknown to solve for.
 
-A step: begin (time, flow, lattice), maps (`passes.rigid_rods`: one matrix exponential per group of
-fibers), fibers, end. Orientation and position are exact in the strain of a step of any size, so a
-step is as long as the times between outputs allow.
+A step (`implicit`): maps (`passes.rigid_rods`: one matrix exponential per group of fibers), fibers,
+contact by `rod_response`. Without contact, orientation and position are exact in the strain of a
+step of any size, so a step is as long as the times between outputs allow.
 Source: Jeffery orbit of a rigid line of N touching beads; a force moves its center by drag
     6 pi eta a N alone.
 Symbols: lambda_J = Q / (Q + 4 w) with Q = N (N^2 - 1) and w beads that carry torque (N, or N - 1
     with plain weights); mu = (1 - lambda_J)/2 = 2 w / (Q + 4 w).
-Limits: no forces between fibers or of walls. Nothing bends: see `scene.rigidity` for what that
-    leaves out.
+Limits: contact is first order in dt. Nothing bends: see `scene.rigidity` for what that leaves out.
 """
 
 from __future__ import annotations

@@ -3,8 +3,14 @@
 A step costs build(s) u / s + PAIR_COST pairs(s) at the skin s, if motion uses up u of it per step.
 Builds tell u and the number of pairs; how the number changes with s follows from the volume around
 a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
-(excluded volume of spherocylinders, Onsager 1949). Nothing here looks at a clock: two runs, and a
-run and its continuation, choose the same skins and so build at the same steps.
+(excluded volume of spherocylinders, Onsager 1949). One list, not two: by their measured parts (ns
+per segment-step, skins in diameters) an outer list of skin 1.5 (build 316, every 44 steps) and one
+of 0.35 filtered from it (distances 36, order 15, every 9 steps) would come to 33 with the sweeps,
+one list of 0.57 (build 225, every 15 steps) to 38: too little for a second test of validity and a
+second list to save.
+
+Nothing here looks at a clock: two runs, and a run and its continuation, choose the same skins and
+so build at the same steps.
 """
 
 from __future__ import annotations
@@ -15,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 # ns, one core, float64, 20,000 segments; only ratios matter.
-BUILD_PIECE, BUILD_NEAR = 140.0, 100.0  # of a piece; of what it finds around it at the first skin
-PAIR_COST = 10.0  # of one more listed pair in a step, gathered too
+BUILD_PIECE, BUILD_NEAR = 110.0, 95.0  # of a piece; of what it finds around it at the first skin
+PAIR_COST = 11.0  # of one more listed pair in a step, gathered too
 START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one

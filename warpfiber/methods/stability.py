@@ -1,4 +1,4 @@
-"""Largest step of the explicit bead chain, term by term, and the step that a scene takes.
+"""Largest step of the explicit methods, term by term, and the step that a scene takes.
 
 Source: the step m* (v1 - v0) = dt (-K x - C v0 - Z v0), x1 = x0 + dt v1 with the drag Z inside m* =
     max(m + dt Z / 2, dt Z) (laws/drag.py) turns unstable through the eigenvalue -1, that is where
@@ -24,6 +24,7 @@ from functools import lru_cache
 import numpy as np
 
 from warpfiber.laws.closure import galerkin_entries
+from warpfiber.methods.bond_steps import bond_steps
 from warpfiber.methods.strain_steps import LARGEST_STRAIN, largest_step, strain_step
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.derived import INERTIALESS
@@ -139,6 +140,8 @@ def _published_closure(n: int, m: float) -> tuple[Bands, ...]:
 
 def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
     group = scene.fibers[index]
+    if scene.numerics.method == "bonded_spheres":
+        return [StepLimit(term, dt, index) for term, dt in bond_steps(scene, group).items()]
     eta = scene.flow.viscosity if scene.flow else 0.0
     a, m = group.radius, group.bead_spacing
     mass = 4.0 / 3.0 * math.pi * a**3 * (group.density or 0.0)

@@ -33,6 +33,7 @@ TIP_FIBERS = 10  # more curves than this say nothing
 _DPI = 160
 _INK, _GRAY = "#22262b", "#6b7280"
 _BLUE, _ORANGE, _GREEN, _PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
+_RED = "#c0445a"
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 _DECADES = 1e10
@@ -88,7 +89,9 @@ _FIGURES = (
         {
             "energy_kinetic": ("kinetic", _BLUE),
             "energy_stretching": ("stretching", _GREEN),
+            "energy_shear": ("shear", _RED),
             "energy_bending": ("bending", _ORANGE),
+            "energy_twist": ("twist", _INK),
             "energy_repulsion": ("repulsion", _PURPLE),
             "energy_wall": ("walls", _GRAY),
         },

@@ -22,16 +22,46 @@ from warpfiber.passes.precision import group_struct
 
 
 @cache
+def make_reply_numbers(name: str):
+    """`reply_numbers(group, dt, segments)`: what a step multiplies the terms of a fiber by."""
+    real = precision(name).real
+    Group = group_struct(name)
+    drag_diagonal, _, _ = make_chain_terms(name)
+    chi, again = real(CHI), real((1.0 - CHI) / CHI)
+
+    @wp.struct
+    class Numbers:
+        h: real
+        kappa: real  # of bending
+        drag_end: real
+        drag_inner: real
+        drag_off: real
+        strength: real  # of turning
+
+    @wp.func
+    def reply_numbers(g: Group, dt: real, segments: wp.int32) -> Numbers:
+        n = Numbers()
+        n.h = chi * dt
+        n.kappa = n.h * g.bending / (g.rest * g.rest)
+        n.drag_end = again * g.drag * drag_diagonal(g.spacing, 0, segments)
+        n.drag_inner = again * g.drag * drag_diagonal(g.spacing, 1, 2)
+        n.drag_off = again * g.drag * g.coupling
+        n.strength = again * g.torque / (g.rest * g.rest)
+        return n
+
+    return reply_numbers
+
+
+@cache
 def make_chain_reply(name: str):
     """`chain_reply`: `node_shift` and `segment_impulse` of one fiber by its `node_push`."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
     Row = elimination_row(name)
-    drag_diagonal, _, _ = make_chain_terms(name)
+    reply_numbers = make_reply_numbers(name)
     sym_mul, _ = make_sym_algebra(name)
     zero = real(0.0)
-    chi, again = real(CHI), real((1.0 - CHI) / CHI)
 
     @wp.func
     def chain_reply(
@@ -48,12 +78,9 @@ def make_chain_reply(name: str):
         segment_impulse: wp.array(dtype=real),
         node_shift: wp.array(dtype=vec3),
     ):
-        h = chi * dt
-        kappa = h * g.bending / (g.rest * g.rest)
-        drag_end = again * g.drag * drag_diagonal(g.spacing, 0, segments)
-        drag_inner = again * g.drag * drag_diagonal(g.spacing, 1, 2)
-        drag_off = again * g.drag * g.coupling
-        strength = again * g.torque / (g.rest * g.rest)
+        n = reply_numbers(g, dt, segments)
+        h = n.h
+        kappa = n.kappa
         for stage in range(2):
             # Forward: r, then v = D^-1 L^-1 r; z0, z1, z2 are the displacements of stage 0 of the
             # nodes k - 1, k, k + 1, couple that of the segment before node k on it.
@@ -72,10 +99,10 @@ def make_chain_reply(name: str):
                 row = rows[base + k]
                 r = h * node_push[i]
                 if stage == 1:
-                    drag = drag_inner
+                    drag = n.drag_inner
                     if k == 0 or k == segments:
-                        drag = drag_end
-                    r += drag * z1 + drag_off * z0 + couple
+                        drag = n.drag_end
+                    r += drag * z1 + n.drag_off * z0 + couple
                     if k < segments:
                         z2 = node_reply[i + 1]
                         weight = g.weight
@@ -84,8 +111,8 @@ def make_chain_reply(name: str):
                         if k == segments - 1:
                             weight += g.weight_excess
                         turn = z2 - z1
-                        couple = (strength * weight) * (turn - wp.dot(row.axis, turn) * row.axis)
-                        r += drag_off * z2 - couple
+                        couple = (n.strength * weight) * (turn - wp.dot(row.axis, turn) * row.axis)
+                        r += n.drag_off * z2 - couple
                         z0 = z1
                         z1 = z2
                 y = r - vec3(wp.dot(row.l0, y1), wp.dot(row.l1, y1), wp.dot(row.l2, y1))

@@ -14,6 +14,7 @@ from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.native import LANES
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
 
@@ -146,6 +147,7 @@ class ChainResponse:
 
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
     block_share: numbers per end in `block`, the ends that a fiber may have on average.
+    native: blocks by SIMD, for the CPU; equal to rounding.
     """
 
     by_ends = True
@@ -157,7 +159,9 @@ class ChainResponse:
         row_stride: int,
         tension: Any,
         block_share: int = BLOCK_SHARE,
+        native: bool | None = None,
     ) -> None:
+        self.native = model.device.startswith("cpu") if native is None else native
         self.block_share = block_share
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
@@ -184,7 +188,8 @@ class ChainResponse:
         model, rows, status = self.model, dual.rows, dual.state.status
         self._allocate(2 * rows.row_i.shape[0])
         fibers = model.fiber_count
-        kernels = make_end_kernels(model.precision.name)
+        name = model.precision.name
+        kernels = make_end_kernels(name, LANES[name] if self.native else 1)
         lists = [rows.row_out_start, dual.fiber_in, dual.row_next]
         counted = [model.fiber_node_start, rows.row_count, *lists, self.end_start]
         scanned = [fibers, self.block.shape[0], status, self.end_start, self.block_start]
@@ -246,7 +251,7 @@ class ChainResponse:
             self.end_force,
             self.end_move,
         ]
-        kernel = make_chain_moves(model.precision.name, dual.has_frozen)
+        kernel = make_chain_moves(model.precision.name, dual.has_frozen, self.native)
         return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
 
     def end(self, dual: ContactDual) -> list[Launch | Call]:

@@ -59,7 +59,8 @@ def make_dual_begin(name: str, law: str, has_frozen: bool):
         axis = wp.normalize(node_start[node + 1] - node_start[node])
         beads = segments * g.spacing + one
         along = wp.dot(axis, normal)
-        return point_mobility(g.drag, g.torque, beads, g.rest * arc, along)
+        weight = segments * g.weight + two * g.weight_excess
+        return point_mobility(g.drag, g.torque, beads, weight, g.rest * arc, along)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def dual_begin(

@@ -1,9 +1,11 @@
 """Motion of rigid rods by forces on their contact rows.
 
-Source: balance of bead drag 6 pi eta a and bead torque 8 pi eta a^3 along a rigid line of N beads:
+Source: balance of bead drag 6 pi eta a along a rigid line of N beads and bead torque
+    8 pi eta a^3 over w of them:
         v = (F0 + F1)/xi,  dp/dt = H (I - p p^T)(F1 - F0)/K_r,  shift = dt (v -/+ H dp/dt)
     with forces F0, F1 at the two ends; a force at the fraction s of the rod is (1 - s) and s of it.
-Symbols: xi = 6 pi eta a N, K_r = 2 pi eta a^3 N (N^2 + 3), H = (N - 1) a, p unit direction.
+Symbols: xi = 6 pi eta a N, K_r = 2 pi eta a^3 (N (N^2 - 1) + 4 w), H = (N - 1) a, p unit
+    direction; w = N, or N - 1 with plain weights.
 Limits: the direction is that of the start of the step, where the rows were made.
 """
 
@@ -74,7 +76,7 @@ def make_rod_response(name: str, has_frozen: bool):
         reach = half * g.rest
         dt = real(step_size[0])
         move = (dt / (g.drag * beads)) * total
-        turning = turning_drag(g.torque, beads)
+        turning = turning_drag(g.torque, beads, g.weight + g.weight_excess + g.weight_excess)
         turn = (dt * reach * reach / turning) * (across - wp.dot(axis, across) * axis)
         node_shift[2 * fiber] = move - turn
         node_shift[2 * fiber + 1] = move + turn

@@ -91,6 +91,18 @@ def chain_capsules(
     return Capsules(center, direction, 0.5 * length, fiber_radius[owner], owner)
 
 
+def stacked(parts: list[Capsules]) -> Capsules:
+    """Capsules one after the other; owners stay distinct."""
+    first: Ints = np.cumsum([0] + [int(part.owner.max()) + 1 for part in parts])
+    return Capsules(
+        np.concatenate([part.center for part in parts]),
+        np.concatenate([part.direction for part in parts]),
+        np.concatenate([part.half for part in parts]),
+        np.concatenate([part.radius for part in parts]),
+        np.concatenate([part.owner + first[k] for k, part in enumerate(parts)]),
+    )
+
+
 def axis_distance(
     offset: Floats, p1: Floats, h1: Floats, p2: Floats, h2: Floats
 ) -> tuple[Floats, Floats, Floats]:

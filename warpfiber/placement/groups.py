@@ -98,7 +98,8 @@ def group_fibers(scene: Scene, cell: Cell, rng: np.random.Generator) -> list[Gro
     groups: list[GroupFibers] = []
     faults: list[Fault] = []
     for index, group in enumerate(scene.fibers):
-        if group.table is not None:  # fibers of many lengths are drawn together
+        # fibers of many lengths are drawn together, shaped ones one after the other
+        if group.table is not None or group.shape.kind != "straight":
             groups.append(GroupFibers(index, cell, group.radius, segments=group.segments))
             continue
         try:
@@ -154,7 +155,7 @@ def _from_statistics(
     made.apart = scene.contact.law != "none"
     made.center = np.zeros((n, 3))
     if not isinstance(group.position, str):
-        made.given = _given_centers(scene, index, group)
+        made.given = given_centers(scene, index, group)
     elif cell.size is None:
         raise _error(scene, index, "position", group.position, "needs a [box]; give centers")
     eigen, axes = np.linalg.eigh(tensor)
@@ -222,7 +223,7 @@ def _aligned(direction: tuple[float, float, float] | None) -> Floats:
     return np.asarray(along / np.linalg.norm(along))
 
 
-def _given_centers(scene: Scene, index: int, group: FiberGroup) -> Floats:
+def given_centers(scene: Scene, index: int, group: FiberGroup) -> Floats:
     """Centers (n, 3) m: one per fiber, or one that all share."""
     centers = np.array(group.position, dtype=np.float64).reshape(-1, 3)
     if len(centers) == 1:

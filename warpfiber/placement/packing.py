@@ -21,7 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpfiber.placement.capsules import Capsules, Floats, Ints, chain_capsules, near_pairs
+from warpfiber.placement.capsules import (
+    Capsules,
+    Floats,
+    Ints,
+    chain_capsules,
+    near_pairs,
+    stacked,
+)
 from warpfiber.placement.capsules import pair_gap as gaps_of
 from warpfiber.placement.groups import GroupFibers, group_fibers
 from warpfiber.placement.insertion import Crowd
@@ -29,6 +36,7 @@ from warpfiber.placement.orientations import orientation_tensor, values_from_ten
 from warpfiber.placement.parts import split_tables
 from warpfiber.placement.populations import pack, population_report, populations
 from warpfiber.placement.relaxation import Freedom, relax
+from warpfiber.placement.shaped import insert_shaped
 from warpfiber.placement.shapes import straight_nodes
 from warpfiber.placement.space import Cell, Inserted
 from warpfiber.scene import Fault, Scene, SceneError
@@ -77,6 +85,7 @@ def place_fibers(scene: Scene, rng: np.random.Generator | None = None) -> Placem
     packing = _Packing(scene, cell, groups, rng)
     packing.insert_files()
     packing.insert_given()
+    packing.insert_shaped()
     packing.insert_random()
     packing.insert_populations()
     return packing.placement(began)
@@ -148,7 +157,7 @@ class _Packing:
         if not self.held or not self.apart:
             return
         last = max(g.index for g in self.groups if g.nodes)
-        capsules = _joined(self.held)
+        capsules = stacked(self.held)
         pairs = near_pairs(capsules, 0.0, self.cell.size, self.cell.periodic)
         if not len(pairs.i):
             return
@@ -187,13 +196,19 @@ class _Packing:
             g.center = g.given.copy()
             self.held.append(g.capsules())
 
+    def insert_shaped(self) -> None:
+        """Fibers that are not straight, as rigid bodies at free places."""
+        for g in self.groups:
+            if self.scene.fibers[g.index].shape.kind != "straight" and not g.nodes:
+                self.held.append(insert_shaped(self.scene, self.cell, g, self.held, self.rng))
+
     def insert_random(self) -> None:
         """Fibers with random centers, longest first; from the first stall on in batches."""
         random = [g for g in self.groups if g.given is None and not g.nodes and len(g.direction)]
         random.sort(key=lambda g: -g.half)
         if not random:
             return
-        loose = _joined([g.capsules() for g in random])
+        loose = stacked([g.capsules() for g in random])
         group = np.repeat(np.arange(len(random)), [len(g.direction) for g in random])
         n = len(loose)
         freedom = Freedom(np.ones(n), np.array([g.turning for g in random])[group])
@@ -247,7 +262,7 @@ class _Packing:
 
     def _relax(self, loose: Capsules, freedom: Freedom, which: Ints) -> bool:
         """Parts overlapping fibers; False, and nothing moved, if they jam."""
-        capsules = _joined([loose.taken(which), *self.held])
+        capsules = stacked([loose.taken(which), *self.held])
         n, more = len(which), len(capsules) - len(which)
         free = Freedom(
             np.append(freedom.translation[which], np.zeros(more)),
@@ -335,15 +350,3 @@ def _group_report(g: GroupFibers) -> dict[str, Any]:
         "directions_redrawn": g.redrawn,
         "tries": g.tries,
     }
-
-
-def _joined(parts: list[Capsules]) -> Capsules:
-    """Capsules one after the other; owners stay distinct."""
-    first: Ints = np.cumsum([0] + [int(part.owner.max()) + 1 for part in parts])
-    return Capsules(
-        np.concatenate([part.center for part in parts]),
-        np.concatenate([part.direction for part in parts]),
-        np.concatenate([part.half for part in parts]),
-        np.concatenate([part.radius for part in parts]),
-        np.concatenate([part.owner + first[k] for k, part in enumerate(parts)]),
-    )

@@ -19,19 +19,12 @@ class Row:
     advice: str
 
 
-METHOD_ADVICE = 'use method = "auto", "bead_chain", "overdamped" or "rigid_rod"'
-STAGE_ADVICE = 'only kind = "flow" runs; end it by end_strain or end_time'
+STAGE_ADVICE = 'only kind = "flow" and "settle" run; end it by end_strain, end_time or end_speed'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("shape", "kind", ("straight",), 'use kind = "straight", or node_file for other shapes'),
-    Row("contact", "law", ("none", "exponential", "linear"),
-        'use law = "exponential", "linear" or "none"'),
-    Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
-    Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
-    Row("stage", "kind", ("flow",), STAGE_ADVICE),
-    Row("stage", "end_speed", (), STAGE_ADVICE),
+    Row("stage", "kind", ("flow", "settle"), STAGE_ADVICE),
     Row("stage", "end_volume_fraction", (), STAGE_ADVICE),
     Row("stage", "end_pressure", (), STAGE_ADVICE),
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
@@ -41,14 +34,27 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
-    Row("numerics", "method", ("bead_chain", "overdamped", "rigid_rod", "auto"), METHOD_ADVICE),
     Row("wall", "", (), 'remove the table; walls are planes at rest, from boundary = "wall"'),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
 
+STRAIGHT = Row("shape", "kind", ("straight",),
+               'fibers of this method are straight at rest; use kind = "straight", '
+               "or node_file to start from another form")  # fmt: skip
+FLOWING = (
+    STRAIGHT,
+    Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
+    Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
+    Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
+    Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+)
+SOFT = Row("contact", "law", ("none", "exponential", "linear"),
+           'use law = "exponential", "linear" or "none"')  # fmt: skip
+
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
+        *FLOWING,
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
         Row("contact", "law", ("none", "exponential"),
@@ -57,10 +63,21 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
             'use contact = "penalty", or method = "overdamped"'),
     ),
     "overdamped": (
+        *FLOWING,
+        SOFT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
+        *FLOWING,
+        SOFT,
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
+    ),
+    "bonded_spheres": (
+        Row("stage", "kind", ("settle",), 'there is no fluid; use kind = "settle"'),
+        Row("contact", "law", ("none", "hertz"), 'use law = "hertz", or "none"'),
+        Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
+        Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),
+        Row("fibers", "inextensible", (False,), "remove it; axial_modulus sets the stretch"),
     ),
 }  # fmt: skip
 """Values that run with one method only, defaults included."""

@@ -23,6 +23,7 @@ DRAGGED = ("bead_chain", *INERTIALESS)
 HOPELESS_FRACTION = 0.9
 """Volume fraction that no packing of straight fibers reaches: touching parallel cylinders fill
 pi/(2 sqrt 3) = 0.907."""
+LARGEST_POISSON = 0.5
 WALL_GAP = 1e-3
 """Gap kept to walls by the placement, in radii."""
 
@@ -64,18 +65,23 @@ def _check_method(draft: Draft) -> None:
     """What the method cannot run, defaults included, and what its step and weight need."""
     for row in NOT_IN_METHOD.get(draft.method or "", ()):
         tables: dict[str, Values | None]
-        if row.table == "fibers":
-            tables = {f"fibers.{index}": group for index, group in enumerate(draft.fibers)}
+        many = {"fibers": draft.fibers, "stage": draft.stages}
+        if row.table in many:
+            tables = {f"{row.table}.{i}": table for i, table in enumerate(many[row.table])}
+        elif row.table == "shape":
+            groups = enumerate(draft.fibers)
+            tables = {f"fibers.{index}.shape": group["shape"] for index, group in groups}
         else:
             tables = {row.table: getattr(draft, row.table)}
         for path, values in tables.items():
             value = values[row.key] if values is not None else None
             remedy = unavailable_in(draft.method, row.table, row.key, value)
-            if value is not None and remedy is not None:
-                given = draft.is_given(f"{path}.{row.key}")
-                draft.faults.add(
-                    f"{path}.{row.key}", value, remedy if given else f"the default is {remedy}"
-                )
+            key = f"{path}.{row.key}"
+            if value is not None and remedy is not None and not draft.faulty(key):
+                given = draft.is_given(key)
+                draft.faults.add(key, value, remedy if given else f"the default is {remedy}")
+    if draft.method == "bonded_spheres":
+        _check_bonded_spheres(draft)
     if draft.method not in INERTIALESS:
         return
     if draft.method == "rigid_rod":
@@ -104,6 +110,27 @@ def _check_rods(draft: Draft) -> None:
     for index in range(len(draft.fibers)):
         if draft.is_given(f"fibers.{index}.inextensible"):
             draft.note(f"fibers.{index}.inextensible has no effect: rods keep their length")
+
+
+def _check_bonded_spheres(draft: Draft) -> None:
+    """No fluid; elastic constants that hold together; rows of stages of unknown length."""
+    if draft.is_given("flow"):
+        draft.faults.add("flow", None, "bonded_spheres has no fluid; remove the table")
+    if draft.numerics["strain_step"] is not None:
+        draft.blame("numerics.strain_step", "nothing is strained at a rate; give dt in s instead")
+    for index, group in enumerate(draft.fibers):
+        path = f"fibers.{index}"
+        if group["bending_modulus"] == 0.0:
+            draft.blame(f"{path}.bending_modulus", "a bond without bending has no shape; give > 0")
+        if (group["poisson_ratio"] or 0.0) > LARGEST_POISSON:
+            draft.blame(f"{path}.poisson_ratio", "no isotropic solid has more than 0.5")
+    for index, stage in enumerate(draft.stages):
+        if stage["time_limit"] is not None and not draft.is_given(f"stage.{index}.time_limit"):
+            limit = number_text(stage["time_limit"])
+            draft.note(
+                f"stage.{index}: rows and frames are spread over time_limit = {limit} s (default); "
+                "give a nearer one for more of them"
+            )
 
 
 def _check_flow(draft: Draft) -> None:
@@ -242,8 +269,6 @@ def _check_contact(draft: Draft) -> None:
     if draft.contact["law"] == "none" and draft.contact["lubrication"] in ("paper", "shifted"):
         remedy = 'law = "none" switches off all pairs; remove it, or use law = "exponential"'
         draft.blame("contact.lubrication", remedy)
-    if draft.contact["law"] == "linear" and draft.contact["stiffness"] is None:
-        draft.faults.add("contact.stiffness", None, 'missing; law = "linear" needs it in N/m')
     if draft.method not in INERTIALESS:
         return
     if draft.contact["law"] == "none" and draft.axes("wall"):

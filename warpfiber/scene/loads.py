@@ -8,9 +8,9 @@ from __future__ import annotations
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.keys import Values
 
-LOADED_METHODS = ("overdamped",)
+LOADED_METHODS = ("overdamped", "bonded_spheres")
 """Methods that know forces on nodes, held nodes and frozen fibers."""
-ADVICE = 'use method = "overdamped"'
+ADVICE = 'use method = "overdamped", without a fluid "bonded_spheres"'
 
 
 def check_loads(draft: Draft) -> None:

@@ -108,6 +108,12 @@ def _resolve_group(draft: Draft, group: Values, path: str) -> None:
         group["position"] = (position,)
     if not draft.is_given(f"{path}.initial_velocity"):
         group["initial_velocity"] = "flow" if draft.flow is not None else "rest"
+    if group["shape"] is not None and group["shape"].get("file") is not None:
+        file = draft.folder / group["shape"]["file"]
+        if not file.is_file():
+            remedy = f"no such file: {file}; it is sought beside the scene"
+            draft.blame(f"{path}.shape.file", remedy)
+        group["shape"]["file"] = str(file.absolute())
     if group["node_file"] is not None:
         file = draft.folder / group["node_file"]
         if not file.is_file():
@@ -137,6 +143,8 @@ def _resolve_count(draft: Draft, group: Values, path: str) -> None:
     if not box["size"] or not box["volume_rule"] or not group["length"]:
         return
     volume = fiber_volume(box["volume_rule"], group["diameter"], group["length"])
+    if group["shape"] is not None and group["shape"]["kind"] == "ring":  # has no ends
+        volume = fiber_volume("centerline", group["diameter"], group["length"])
     space = math.prod(box["size"])
     share = volume / space if space > 0.0 else 0.0
     asked = group["volume_fraction"]
@@ -217,7 +225,8 @@ def _segments(draft: Draft, group: Values, index: int, place: str, asked: float)
 def _resolve_contact(draft: Draft) -> None:
     """Default strength D_0 = 1000 eta rate a^2 of the thickest fibers."""
     contact = draft.contact
-    if contact["law"] != "exponential" and not draft.axes("wall"):
+    pushing = contact["law"] == "exponential" or bool(draft.axes("wall"))
+    if draft.method == "bonded_spheres" or not pushing:
         contact["strength"], contact["decay"] = 0.0, 50.0
         return
     if contact["law"] == "none":  # no pairs, but walls still hold

@@ -34,7 +34,7 @@ class Stage:
     """One `[[stage]]`: what happens until its first end condition, counted from its start."""
 
     kind: str
-    """flow"""
+    """flow, settle"""
     name: str
     """the kind, if none was given"""
     save: bool = False
@@ -48,6 +48,8 @@ class Stage:
     """Pa"""
     time_limit: float | None = None
     """s; None where end_strain or end_time ends the stage"""
+    damping: float = 0.0
+    """1/s on the velocities of the nodes, of `settle`"""
     repeat_from: str | None = None
     """name of an earlier stage (or this one)"""
     repeat: int = 1

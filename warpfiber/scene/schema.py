@@ -350,7 +350,12 @@ NUMERICS = Table(
         ),
         Key("allow_unstable_dt", Switch(), default=False),
         Key("precision", Choice(("float32", "float64")), default="float64"),
-        Key("bond_shear", Choice(("rbf", "ga")), methods=("bonded_spheres",)),
+        Key(
+            "bond_shear",
+            Choice(("rbf", "ga")),
+            methods=("bonded_spheres",),
+            method_default=(("bonded_spheres", "rbf"),),
+        ),
         Key("device", Device(), default="auto"),
         Key("workers", Either((COUNT, AUTO))),
         Key("skin", Either((LENGTH, AUTO))),

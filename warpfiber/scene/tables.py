@@ -96,7 +96,23 @@ class Shape:
     """`shape` of a fiber group: the stress-free form."""
 
     kind: str
-    """straight; the others and their keys are not available in this version"""
+    """straight, ring, s, u, z, bent, points"""
+    curvature: float | None = None
+    """1/m, of an s"""
+    angle: float | None = None
+    """degrees, dihedral angle of the tips of a u"""
+    middle: float | None = None
+    """m, of a bent one"""
+    tip: float | None = None
+    """m, each of the two tips"""
+    corner1: float | None = None
+    """degrees, interior angle between first tip and middle"""
+    corner2: float | None = None
+    """degrees, between middle and last tip"""
+    dihedral: float | None = None
+    """degrees, between the planes of the tips: 0 on one side, 180 on opposite ones"""
+    file: str | None = None
+    """absolute path of the node file of one fiber"""
 
 
 @dataclass(frozen=True, kw_only=True)

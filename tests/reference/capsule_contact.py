@@ -1,0 +1,236 @@
+"""Contact of sphero-cylinders in float64 NumPy: all pairs, curvature tensors, quadrature, memories.
+
+Source: elliptic Hertz contacts from the sum of two curvature tensors; along a line where fibers are
+    within 30 degrees of each other and the patch is longer than half a segment; the vertex rule;
+    shares of minima in the hollow of a kink; Mindlin and Coulomb. Written with eigenvalues and
+    numerical integrals, where the kernels have closed forms.
+Symbols: x, v, w nodes of both fibers; s, t parts of the two segments; n from the first to the
+    second; a memory is (displacement, stiffness a step ago).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tests.reference.bonded_spheres import Array, Rod
+from tests.reference.segments import closest_points
+
+NEAR = 1e-9
+
+
+@dataclass
+class Laws:
+    """Numbers of the contact."""
+
+    modulus: float = 7.5e5
+    poisson: float = 0.5
+    damping: float = 0.0
+    friction: float = 0.0
+    memories: dict[tuple[int, int], tuple[Array, float]] = field(default_factory=dict)
+
+    @property
+    def effective(self) -> float:
+        """E* of two equal materials."""
+        return 0.5 * self.modulus / (1.0 - self.poisson**2)
+
+    @property
+    def shear_ratio(self) -> float:
+        """k_t / k_n = 8 G* / (2 E*)."""
+        shear = 0.5 * self.modulus / (1.0 + self.poisson)
+        return 4.0 * shear / (2.0 * (2.0 - self.poisson)) / self.effective
+
+
+def hertz(laws: Laws, tensors: list[Array], depth: float) -> tuple[float, float]:
+    """Force and stiffness of surfaces with these curvature tensors (2, 2) in one plane."""
+    small, large = np.linalg.eigvalsh(np.sum(tensors, axis=0))
+    correction = 1.0 - ((large / small) ** 0.0684 - 1.0) ** 1.531
+    root = (small * large) ** -0.25
+    force = 4.0 / 3.0 * laws.effective * root * depth**1.5 * correction**-1.5
+    return force, 1.5 * force / depth
+
+
+def curvature(radius: float, angle: float | None) -> Array:
+    """Of a cylinder whose axis has this angle in the plane; None: of a sphere."""
+    if angle is None:
+        return np.eye(2) / radius
+    across = np.array([-math.sin(angle), math.cos(angle)])
+    return np.outer(across, across) / radius
+
+
+@dataclass
+class Touch:
+    """What one pair of segments does: spring force, stiffness, and where."""
+
+    force: float
+    stiffness: float
+    s: float
+    t: float
+
+
+def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: float) -> Touch | None:
+    """Contact along a line; None where the pair of segments is to be taken as a point."""
+    la, lb = np.linalg.norm(a), np.linalg.norm(b)
+    cosine = abs(a @ b) / (la * lb)
+    if cosine <= math.cos(math.radians(30.0)):
+        return None
+    sine = max(float(np.linalg.norm(np.cross(a, b)) / (la * lb)), 0.02)
+    middle = a / la + math.copysign(1.0, a @ b) * b / lb
+    middle /= np.linalg.norm(middle)
+
+    def gap(z: float | Array) -> Array:
+        """From a to b at the coordinate z along the mean direction."""
+        s = np.asarray(z) / (a @ middle)
+        t = (np.asarray(z) - delta @ middle) / (b @ middle)
+        return delta + np.multiply.outer(t, b) - np.multiply.outer(s, a)
+
+    zero, slope = gap(0.0), gap(1.0) - gap(0.0)
+    steep = slope @ slope
+    square = zero @ zero - (zero @ slope) ** 2 / steep if steep > 0.0 else zero @ zero
+    reach, least = ra + rb, math.sqrt(max(square, 0.0))
+    depth = reach - least
+    if depth < 0.0 or 2.0 * reach * depth < (0.25 * min(la, lb) * sine) ** 2:
+        return None
+    ends = sorted([delta @ middle, (delta + b) @ middle])
+    low, high = max(0.0, ends[0]), min(float(a @ middle), ends[1])
+    if low >= high:
+        return Touch(0.0, 0.0, 0.0, 0.0)
+    nodes, weights = np.polynomial.legendre.leggauss(3)  # exact for what is integrated
+    if steep > 0.0:
+        center = -(zero @ slope) / steep
+        half = math.sqrt(max(reach**2 - square, 0.0) / steep)
+        low, high = max(low, center - half), min(high, center + half)
+        if low >= high:
+            return Touch(0.0, 0.0, 0.0, 0.0)
+    z = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+    overlap = (reach**2 - (gap(z) ** 2).sum(1)) / (reach + least)
+    weights = 0.5 * (high - low) * weights
+    integral = float(weights @ overlap)
+    # a whole patch of length 2 sqrt(2 reach delta) / sine has the force of Hertz
+    whole = 4.0 / 3.0 * math.sqrt(2.0 * reach) * depth**1.5 / sine
+    angle = math.asin(min(1.0, sine))
+    per_integral = hertz(laws, [curvature(ra, 0.0), curvature(rb, angle)], depth)[0] / whole
+    place = float(weights @ (overlap * z)) / integral
+    t = (place - delta @ middle) / (b @ middle)
+    return Touch(
+        per_integral * integral,
+        per_integral * (high - low),
+        place / float(a @ middle),
+        min(max(t, 0.0), 1.0),
+    )
+
+
+def hollow(x: Array, vertex: int, beyond: int, other: int) -> bool:
+    """Whether the fiber comes nearer again to the segment `other` beyond one of its nodes."""
+    _, t = closest_points(x[vertex], x[vertex], x[other], x[other + 1])
+    away = x[other] + t * (x[other + 1] - x[other]) - x[vertex]
+    onward = x[beyond] - x[vertex]
+    return bool(away @ onward > NEAR * (onward @ onward))
+
+
+def share(
+    x: Array, part: float, segment: int, other: int, ends: tuple[int, int], patch: float
+) -> float:
+    """What is left of a minimum where the neighbor beyond a kink has one in the same patch."""
+    length = float(np.linalg.norm(x[segment + 1] - x[segment]))
+    left = 1.0
+    for vertex, step, far in ((segment, -1, part), (segment + 1, 1, 1.0 - part)):
+        inner = vertex not in ends
+        if inner and far * length < patch and hollow(x, vertex, vertex + step, other):
+            left *= 0.5 + 0.5 * far * length / patch
+    return left
+
+
+def touch(laws: Laws, x: Array, i: int, j: int, rods: tuple[Rod, Rod]) -> Touch | None:
+    """What segments i and j (first nodes in x) of the fibers do; x: nodes of both, one by one."""
+    count = len(rods[0].rest)
+    first = (0, count)
+    last = (count - 2, count + len(rods[1].rest) - 2)
+    a, b, delta = x[i + 1] - x[i], x[j + 1] - x[j], x[j] - x[i]
+    ra, rb = rods[0].radius, rods[1].radius
+    s, t = closest_points(x[i], x[i + 1], x[j], x[j + 1])
+    c = delta + t * b - s * a
+    depth = ra + rb - float(np.linalg.norm(c))
+    if depth <= 0.0:
+        return None
+    line = line_touch(laws, delta, a, b, ra, rb)
+    end_a = (s <= NEAR and i == first[0]) or (s >= 1.0 - NEAR and i == last[0])
+    end_b = (t <= NEAR and j == first[1]) or (t >= 1.0 - NEAR and j == last[1])
+    if line is not None and not (end_a or end_b):
+        return line if line.force > 0.0 else None
+    reported = not (s >= 1.0 - NEAR and i < last[0]) and not (t >= 1.0 - NEAR and j < last[1])
+    if s <= NEAR and i > first[0]:
+        reported &= bool(c @ (x[i] - x[i - 1]) >= 0.0)
+    if t <= NEAR and j > first[1]:
+        reported &= bool(c @ (x[j] - x[j - 1]) <= 0.0)
+    if not reported:
+        return line if line is not None and line.force > 0.0 else None
+    sine = np.linalg.norm(np.cross(a, b)) / np.linalg.norm(a) / np.linalg.norm(b)
+    angle = math.asin(min(1.0, max(float(sine), 0.02)))
+    tensors = [curvature(ra, None if end_a else 0.0), curvature(rb, None if end_b else angle)]
+    force, stiffness = hertz(laws, tensors, depth)
+    patch = math.sqrt(2.0 * (ra + rb) * depth) / math.sin(angle)
+    part = share(x, s, i, j, (first[0], last[0] + 1), patch)
+    part *= share(x, t, j, i, (first[1], last[1] + 1), patch)
+    force, stiffness = part * force, part * stiffness
+    if line is not None and line.force >= force:
+        return line
+    return Touch(force, stiffness, s, t)
+
+
+def contact_loads(
+    laws: Laws, rods: tuple[Rod, Rod], x: Array, v: Array, w: Array, dt: float
+) -> tuple[Array, Array]:
+    """Forces and moments on all nodes of two fibers; memories move on by dt."""
+    forces, moments = np.zeros_like(x), np.zeros_like(x)
+    count = len(rods[0].rest)
+    mass = np.concatenate([rods[0].mass, rods[1].mass])
+    for i, j in itertools.product(range(count - 1), range(count, len(x) - 1)):
+        found = touch(laws, x, i, j, rods)
+        before = laws.memories.pop((i, j), (np.zeros(3), 0.0))
+        if found is None:
+            continue
+        weights = (np.array([1.0 - found.s, found.s]), np.array([1.0 - found.t, found.t]))
+        nodes = (np.array([i, i + 1]), np.array([j, j + 1]))
+        c = weights[1] @ x[nodes[1]] - weights[0] @ x[nodes[0]]
+        distance = float(np.linalg.norm(c))
+        n = c / distance
+        arms = 0.5 * (distance + rods[0].radius - rods[1].radius)
+        levers = (arms * n, -(distance - arms) * n)
+        speeds, spins, softness = [], [], 0.0
+        for side in (0, 1):
+            spin = weights[side] @ w[nodes[side]]
+            speeds.append(weights[side] @ v[nodes[side]] + np.cross(spin, levers[side]))
+            spins.append(spin)
+            softness += float((weights[side] ** 2 / mass[nodes[side]]).sum())
+        slip = speeds[0] - speeds[1]
+        damper = 2.0 * math.sqrt(5.0 / 6.0) * laws.damping
+        resistance = damper * math.sqrt(found.stiffness / softness)
+        size = max(found.force + resistance * float(slip @ n), 0.0)
+        force = -size * n
+        if laws.friction > 0.0:
+            stiffness = laws.shear_ratio * found.stiffness
+            h, old = before
+            if old > 0.0:
+                length = np.linalg.norm(h)
+                h = h - (h @ n) * n
+                h = h + 0.5 * dt * float((spins[0] + spins[1]) @ n) * np.cross(n, h)
+                h = h * (length / max(float(np.linalg.norm(h)), 1e-30))
+                h = h * min(1.0, stiffness / old)
+            slide = slip - (slip @ n) * n
+            h = h + dt * slide
+            drag = -stiffness * h - damper * math.sqrt(stiffness / softness) * slide
+            most = laws.friction * size
+            if np.linalg.norm(drag) > most:
+                drag = drag * (most / np.linalg.norm(drag))
+                h = -drag / stiffness
+            laws.memories[(i, j)] = (h, stiffness)
+            force = force + drag
+        for side, sign in ((0, 1.0), (1, -1.0)):
+            couple = np.cross(levers[side], sign * force)
+            np.add.at(forces, nodes[side], sign * np.outer(weights[side], force))
+            np.add.at(moments, nodes[side], np.outer(weights[side], couple))
+    return forces, moments

@@ -1,0 +1,49 @@
+"""Tangential force of a contact: an elastic memory of its path, limited by Coulomb's law.
+
+Source: Mindlin without partial slip, k_t = 8 G* sqrt(R* delta); the memory is kept in the plane of
+    the contact, turns with the mean spin about the normal and shrinks where the contact unloads
+    (Thornton, Cummins & Cleary 2013: else energy is created). Sliding leaves the memory at the
+    limit.
+Symbols: h elastic displacement of this side against the other, k its stiffness a step ago (0: no
+    contact then), n normal, v tangential velocity of this side against the other.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpfiber.model import precision
+
+
+@cache
+def make_friction(name):
+    """`carried_memory` and `friction_force` in the given precision."""
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    zero = real(0.0)
+    tiny = real(1.0e-30)
+
+    @wp.func
+    def carried_memory(h: vec3, k_before: real, k: real, n: vec3, turn: real) -> vec3:
+        """h in the present plane, turned by `turn` (rad, small) about n."""
+        if k_before <= zero:
+            return vec3(zero, zero, zero)
+        size = wp.length(h)
+        flat = h - wp.dot(h, n) * n
+        flat += turn * wp.cross(n, flat)
+        flat = (size / wp.max(wp.length(flat), tiny)) * flat
+        if k < k_before:
+            flat *= k / k_before
+        return flat
+
+    @wp.func
+    def friction_force(h: vec3, k: real, damping: real, v: vec3, limit: real):
+        """Force on this side, and the memory that is left, for the present memory h."""
+        force = -k * h - damping * v
+        size = wp.length(force)
+        if size <= limit:
+            return force, h
+        force *= limit / wp.max(size, tiny)
+        return force, (real(-1.0) / k) * force
+
+    return carried_memory, friction_force

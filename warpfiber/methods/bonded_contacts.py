@@ -1,0 +1,98 @@
+"""Pairs of bonded spheres that may touch: their list, what they do, and the memory of friction.
+
+Fibers stay unwrapped, so a pair keeps its image from list to list and its memory can be found
+again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.methods.pair_search import PairSearch
+from warpfiber.model import Model, State
+from warpfiber.passes.capsule_pairs import CapsuleFeatures, carry_memories, make_carry_memory
+from warpfiber.passes.pairs import PairFeatures
+from warpfiber.scene import Scene
+
+
+class BondedContacts:
+    """Neighbor list and pair arrays of one run."""
+
+    def __init__(
+        self, scene: Scene, model: Model, state: State, workers: int, stretch: float
+    ) -> None:
+        self.model, self.state = model, state
+        self.features = CapsuleFeatures(
+            periodic=any(model.domain.periodic),
+            dashpot=scene.contact.damping > 0.0,
+            friction=scene.contact.friction > 0.0,
+        )
+        self.measured = PairFeatures(repulsion=False, periodic=self.features.periodic)
+        reach = 2.0 * max(row["radius"] for row in model.group_rows)
+        self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
+        self._allocate()
+
+    def _allocate(self) -> None:
+        p, device = self.model.precision, self.model.device
+        size = self.search.list.pair_capacity
+        self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
+        self.force = wp.zeros(size, dtype=p.vec3, device=device)
+        self.moment = wp.zeros(size, dtype=p.vec3, device=device)
+        self.arms = wp.zeros(size, dtype=p.vec4, device=device)
+        kept = size if self.features.friction else 0
+        self.memory = wp.zeros(kept, dtype=p.vec3, device=device)
+        self.stiffness = wp.zeros(kept, dtype=p.real, device=device)
+
+    def kernels(self) -> list[Any]:
+        """What a build launches."""
+        name = self.model.precision.name
+        return [*self.search.list.kernels.values(), make_carry_memory(name)]
+
+    def _listed(self) -> list[Any]:
+        pairs = self.search.list
+        return [pairs.out_start, pairs.pair_j, pairs.pair_image, *self._memories()]
+
+    def _memories(self) -> list[Any]:
+        return [self.acts, self.memory, self.stiffness]
+
+    def build(self, step: int) -> bool:
+        """Build the list now and take the memories over; True if arrays were replaced."""
+        carries = self.features.friction and self.search.list.build_count > 0
+        before = [wp.clone(array) for array in self._listed()] if carries else []
+        replaced = self.search.refresh(step, wrap=False)
+        if replaced:
+            self._allocate()
+        if carries:
+            model = self.model
+            after = self._listed()
+            carry_memories(model.precision.name, model.segment_count, before, after, model.device)
+        else:
+            self.acts.zero_()
+        return replaced
+
+    def expire(self, step: int) -> bool | None:
+        """Another skin and a new list; True if arrays were replaced, None if none lasts a step."""
+        return self.build(step) if self.search.use_up(step) else None
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Skin, stretch and memories by pair: what the next list depends on."""
+        count = self.search.list.pair_count
+        arrays = self.search.saved() | {"contact_acts": self.acts.numpy()[:count].copy()}
+        if self.features.friction:
+            arrays["contact_memory"] = self.memory.numpy()[:count].copy()
+            arrays["contact_stiffness"] = self.stiffness.numpy()[:count].copy()
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
+        """Build again the list of the saved run, and give its pairs their memories."""
+        self.search.restore(arrays, step)
+        self._allocate()
+        count = self.search.list.pair_count
+        self.acts[:count].assign(arrays["contact_acts"])
+        if self.features.friction:
+            self.memory[:count].assign(arrays["contact_memory"])
+            self.stiffness[:count].assign(arrays["contact_stiffness"])

@@ -1,0 +1,142 @@
+"""The launches of one step of bonded spheres, with the arguments of every kernel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.passes.bond_drift import make_bond_drift
+from warpfiber.passes.bonds import make_bond_sweep
+from warpfiber.passes.capsule_pairs import make_capsule_pairs
+from warpfiber.passes.clock import make_clock
+from warpfiber.passes.executor import Launch
+
+if TYPE_CHECKING:
+    from warpfiber.methods.bonded_spheres import BondedSpheres
+
+
+def clock_launch(spheres: BondedSpheres) -> Launch:
+    """Time and step."""
+    state, model = spheres.state, spheres.model
+    inputs = [
+        wp.float64(spheres.dt),
+        wp.float64(0.0),
+        wp.mat33d(),
+        wp.array(spheres.schedule, dtype=wp.vec2d, device=model.device),
+        state.status,
+        state.step,
+        state.time,
+        state.strain,
+        state.gradient,
+        state.lattice,
+        state.lattice_now,
+        state.deformation,
+    ]
+    return Launch("clock", make_clock(model.precision.name, False, False), 1, inputs)
+
+
+def drift_launch(spheres: BondedSpheres) -> Launch:
+    """Half kick and drift of all nodes."""
+    model, state = spheres.model, spheres.state
+    assert spheres.list is not None
+    inputs = [
+        model.precision.real(spheres.dt),
+        spheres.list.skin_out,
+        model.fiber_node_start,
+        state.list_pos,
+        spheres.place,
+        state.node_pos,
+        state.node_velocity,
+        spheres.node_turn,
+        spheres.node_spin,
+        spheres.node_rate,
+        spheres.node_spin_rate,
+        state.status,
+    ]
+    kernel = make_bond_drift(model.precision.name)
+    return Launch("drift", kernel, model.fiber_count, inputs, split=True)
+
+
+def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
+    """What all listed pairs do; memories of friction move on by dt."""
+    model, state, p = spheres.model, spheres.state, spheres.model.precision
+    contacts, pairs = spheres.contacts, spheres.list
+    assert contacts is not None and pairs is not None
+    inputs = [
+        p.real(dt),
+        p.real(spheres.scene.contact.damping),
+        p.real(spheres.scene.contact.friction),
+        spheres.groups,
+        model.fiber_node_start,
+        model.fiber_group,
+        model.segment_node,
+        model.segment_fiber,
+        state.lattice_now,
+        pairs.out_start,
+        pairs.pair_j,
+        pairs.pair_image,
+        spheres.place,
+        state.node_pos,
+        state.node_velocity,
+        spheres.node_spin,
+        contacts.acts,
+        contacts.force,
+        contacts.moment,
+        contacts.arms,
+        contacts.memory,
+        contacts.stiffness,
+        state.status,
+    ]
+    kernel = make_capsule_pairs(p.name, contacts.features)
+    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
+
+
+def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
+    """Loads of bonds, walls and gathered pairs, and the kicks (see `make_bond_sweep`)."""
+    model, state, p = spheres.model, spheres.state, spheres.model.precision
+    low, high = wall_places(spheres)
+    none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
+    none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
+    gathered: list[Any] = [none_i, none_i, none_i, spheres.pair_acts, none_3, none_3]
+    gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
+    if spheres.contacts is not None:
+        pairs, contacts = spheres.contacts.search.list, spheres.contacts
+        gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
+        gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
+    inputs = [
+        p.real(spheres.dt),
+        low,
+        high,
+        p.real(spheres.scene.contact.damping),
+        p.real(spheres.scene.contact.wall_friction),
+        spheres.stage,
+        spheres.groups,
+        model.fiber_node_start,
+        model.fiber_group,
+        spheres.bond_axis,
+        spheres.bond_length,
+        spheres.node_hold,
+        spheres.node_load,
+        *gathered,
+        spheres.wall_memory,
+        spheres.wall_stiffness,
+        spheres.place,
+        state.node_pos,
+        state.node_velocity,
+        spheres.node_turn,
+        spheres.node_spin,
+        spheres.node_rate,
+        spheres.node_spin_rate,
+        spheres.still_steps,
+        state.status,
+    ]
+    kernel = make_bond_sweep(p.name, spheres.features, drifts, kicks)
+    return Launch("bonds", kernel, model.fiber_count, inputs, split=True)
+
+
+def wall_places(spheres: BondedSpheres) -> tuple[Any, Any]:
+    """Lower and upper corner of the box."""
+    low = np.asarray(spheres.model.domain.low)
+    return wp.vec3d(*low), wp.vec3d(*(low + np.asarray(spheres.model.domain.size)))

@@ -1,0 +1,309 @@
+"""Fibers as spheres joined by elastic bonds, after Xu, Ma & Guo 2023: translation and rotation.
+
+A step: clock, bonds (kick, drift, loads of bonds, walls, weight and single nodes, kick). Where
+fibers meet, drift (kick, drift), pairs (contact of segments) and bonds (loads, kick).
+Source: bonds in total form with the placed shape as the stress-free one (`laws.bond`), velocity
+    Verlet, contacts by Hertz, Mindlin and Coulomb. The paper adds up bond moments step by step;
+    here they follow from the state.
+Limits: walls are planes at rest; dt below `stability.step_limits`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.methods.bond_constants import bond_constants, is_closed
+from warpfiber.methods.bonded_contacts import BondedContacts
+from warpfiber.methods.bonded_launches import (
+    bond_launch,
+    clock_launch,
+    drift_launch,
+    pair_launch,
+    wall_places,
+)
+from warpfiber.methods.loads import node_loads
+from warpfiber.methods.method import Method
+from warpfiber.model import EXPIRED, TORN, Model, State
+from warpfiber.passes import held_nodes
+from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
+from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.bonds import (
+    CLAMPED,
+    END_SPEED,
+    FREE,
+    HELD,
+    SETTLING,
+    STAGE_SIZE,
+    BondFeatures,
+)
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat
+from warpfiber.passes.node_walls import SIDES
+from warpfiber.passes.nodes import TEAR_STRETCH
+from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
+
+STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
+
+# Arrays that the next step depends on beside the State.
+_CARRIED = (
+    "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place "
+    "wall_memory wall_stiffness"
+).split()
+
+
+class BondedSpheres(Method):
+    """Advances a State of nodes that also turn."""
+
+    own_energy = True
+
+    def __init__(
+        self, scene: Scene, model: Model, state: State, dt: float, workers: int | None = None
+    ) -> None:
+        super().__init__(scene, model, state, dt, workers)
+        p, device, nodes = model.precision, model.device, model.node_count
+        self.started = False
+        self.features = BondFeatures(
+            dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
+            walls=model.domain.wall,
+            loads=bool(scene.loads) or any(group.frozen for group in scene.fibers),
+            closed=any(is_closed(group) for group in scene.fibers),
+            pairs=scene.contact.law != "none" and model.segment_count > 1,
+            wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
+        )
+        self.groups = wp.array(
+            [self._group(group) for group in scene.fibers],
+            dtype=bond_group_struct(p.name),
+            device=device,
+        )
+        axis, length = self._stress_free()
+        self.bond_axis = wp.array(axis.astype(p.numpy), dtype=p.vec3, device=device)
+        self.bond_length = wp.array(length.astype(p.numpy), dtype=p.real, device=device)
+        hold, load = self._loads()
+        self.node_hold = wp.array(hold, dtype=wp.int32, device=device)
+        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
+        identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], dtype=p.numpy), (nodes, 1))
+        self.node_turn = wp.array(identity, dtype=p.vec4, device=device)
+        self.node_spin = wp.zeros(nodes, dtype=p.vec3, device=device)
+        self.node_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
+        self.node_spin_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
+        self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
+        kept = SIDES * nodes if self.features.wall_friction else 0
+        self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
+        self.wall_stiffness = wp.zeros(kept, dtype=p.real, device=device)
+        self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
+        self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
+        # float64 in every precision: world positions in float32 lose slow motion
+        self.place = state.node_pos
+        if p.name == "float32":
+            self.place = wp.zeros(nodes, dtype=wp.vec3d, device=device)
+        self.contacts: BondedContacts | None = None
+        if self.features.pairs:
+            stretch = float(self._segment_stretch().max())
+            self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
+            self.list = self.contacts.search.list
+            self.pair_features = self.contacts.measured
+
+    # -- building ---------------------------------------------------------------------------------
+
+    def _group(self, group: FiberGroup) -> Any:
+        """Constants of a group in run units."""
+        p, units = self.model.precision, self.model.units
+        c = bond_constants(self.scene, group)
+        linear, angular = units.force / units.length, units.force * units.length
+        scale = np.array([linear, linear, angular, angular])
+        inertia = units.mass * units.length**2
+        row = bond_group_struct(p.name)()
+        row.radius = group.radius / units.length
+        row.stiffness = p.vec4(*(np.asarray(c.stiffness) / scale))
+        row.dashpots = p.vec4(*(np.asarray(c.dashpots) / (scale * units.time)))
+        row.mass, row.end_mass = c.mass / units.mass, c.end_mass / units.mass
+        row.inertia, row.end_inertia = c.inertia / inertia, c.end_inertia / inertia
+        weight = np.zeros(3)
+        if self.scene.gravity is not None and group.density:
+            buoyant = 1.0 - self.scene.gravity.fluid_density / group.density
+            weight = buoyant * np.asarray(self.scene.gravity.acceleration)
+        row.weight = p.vec3(*(weight * units.time**2 / units.length))
+        stress = units.force / units.length**2
+        row.wall_modulus = c.wall_modulus / stress
+        row.compliance = c.compliance * stress
+        row.shear_compliance = c.shear_compliance * stress
+        row.segments = group.segments
+        row.torn_length = TEAR_STRETCH * c.segment_length / units.length
+        row.closed = int(is_closed(group))
+        return row
+
+    def _stress_free(self) -> tuple[np.ndarray, np.ndarray]:
+        """Direction and length of the bond from every node to the next one of its fiber."""
+        nodes = self.state.node_pos.numpy().astype(float)
+        start = self.model.host["fiber_node_start"]
+        after = np.arange(len(nodes)) + 1
+        after[start[1:] - 1] = start[:-1]
+        chord = nodes[after] - nodes
+        length = np.linalg.norm(chord, axis=1)
+        return chord / length[:, None], length
+
+    def _loads(self) -> tuple[np.ndarray, np.ndarray]:
+        """How every node is held, and its force, or its velocity where it is held.
+
+        A clamp holds one node and its orientation: that is its segment's at this end.
+        """
+        scene, model = self.scene, self.model
+        imposed, load = node_loads(scene, model)
+        hold = np.full(len(imposed), FREE, dtype=np.int32)
+        hold[imposed == held_nodes.HELD] = HELD
+        hold[imposed == held_nodes.FROZEN] = CLAMPED
+        start, group = model.host["fiber_node_start"], model.host["fiber_group"]
+        for row in scene.loads:
+            if row.hold == "clamp" and not scene.fibers[row.group].frozen:
+                fiber = np.flatnonzero(group == row.group)[row.fiber]
+                nodes = np.arange(start[fiber], start[fiber + 1])
+                clamped = nodes[row.node]
+                other = clamped + 1 if clamped < nodes[-1] else clamped - 1
+                hold[clamped], hold[other], load[other] = CLAMPED, FREE, 0.0
+        return hold, load
+
+    # -- the step ---------------------------------------------------------------------------------
+
+    def launches(self) -> list[Launch | Call | Repeat]:
+        """Clock and bonds; drift and pairs before the bonds where fibers meet."""
+        if self.contacts is None:
+            return [clock_launch(self), bond_launch(self, drifts=True, kicks=True)]
+        return [
+            clock_launch(self),
+            drift_launch(self),
+            pair_launch(self, self.dt),
+            bond_launch(self, drifts=False, kicks=True),
+        ]
+
+    @property
+    def box_width(self) -> float:
+        """Smallest height that a periodic box may have, run units; with the start skin."""
+        return self.contacts.search.box_width if self.contacts is not None else 0.0
+
+    def prepare(self, measuring: Iterable[Any] = ()) -> None:
+        """Compile and capture; find the accelerations of the start."""
+        kernels = list(measuring)
+        if self.executor is None and "energy" in self.scene.record.quantities:
+            kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
+        if self.contacts is not None:
+            kernels += self.contacts.kernels()
+        super().prepare(kernels)
+        if self.started:
+            return
+        self.started = True
+        if self.place is not self.state.node_pos:
+            self.place.assign(self.state.node_pos.numpy().astype(float))
+        first: list[Launch | Call | Repeat] = [bond_launch(self, drifts=False, kicks=False)]
+        if self.contacts is not None:
+            if self.contacts.build(self.step_count):
+                self._stop_executor()
+                super().prepare()  # a list that grew has other arrays
+            first = [pair_launch(self, 0.0), bond_launch(self, drifts=False, kicks=False)]
+        begin = Executor(first, self.model.device)
+        begin.run(1, self._halted)
+        begin.close()
+
+    def _settle(self) -> bool:
+        """Build the list anew if it has expired; False if a fiber tore."""
+        status = self._status()
+        if status[TORN]:
+            return False
+        if status[EXPIRED] and self.contacts is not None:
+            replaced = self.contacts.expire(self.step_count)
+            if replaced is None:
+                remedy = "fibers move farther in one step than any skin; give a smaller dt"
+                raise SceneError([Fault(self.scene.path, "numerics.dt", None, remedy)])
+            if replaced:
+                self._stop_executor()
+            self.list_seconds = self.contacts.search.seconds
+        return True
+
+    def list_report(self) -> dict[str, float]:
+        """What the search for pairs did; nothing without a list."""
+        return self.contacts.search.report(self.step_count) if self.contacts is not None else {}
+
+    def close(self) -> None:
+        """Stop worker threads."""
+        super().close()
+        if self.contacts is not None:
+            self.contacts.search.close()
+
+    def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
+        """Take over the damping of a stage; count anew how long all nodes have been still."""
+        units = self.model.units
+        numbers = np.zeros(STAGE_SIZE, dtype=self.model.precision.numpy)
+        numbers[SETTLING] = stage.damping * units.time
+        numbers[END_SPEED] = ((stage.end_speed or 0.0) / units.velocity) ** 2
+        self.stage.assign(numbers)
+        if not resumed:
+            self.still_steps.zero_()
+
+    def steps_left(self, stage: Stage) -> int | None:
+        """Steps before which `end_speed` surely does not end the stage; None without it."""
+        if stage.end_speed is None:
+            return None
+        return max(0, self.still_needed - int(self.still_steps.numpy().min()))
+
+    def unmet(self, stage: Stage) -> str:
+        """What `end_speed` still waits for."""
+        if stage.end_speed is None:
+            return ""
+        velocity = self.state.node_velocity.numpy().astype(float)
+        fastest = float(np.linalg.norm(velocity, axis=1).max()) * self.model.units.velocity
+        return f"end_speed = {stage.end_speed:g} m/s; the fastest node moves at {fastest:.4g} m/s"
+
+    # -- what is saved and told -------------------------------------------------------------------
+
+    def measure(self) -> dict[str, float]:
+        """Energies in J, where `record.quantities` asks for them."""
+        if "energy" not in self.scene.record.quantities:
+            return {}
+        model, walls = self.model, self.features.walls
+        inputs = [
+            *wall_places(self),
+            self.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            self.bond_axis,
+            self.bond_length,
+            self.place,
+            self.state.node_velocity,
+            self.node_turn,
+            self.node_spin,
+        ]
+        found = measure_bond_energies(
+            model.precision.name, walls, model.fiber_count, inputs, model.device
+        )
+        absent = {"gravity"} if self.scene.gravity is None else set()
+        absent |= set() if any(walls) else {"wall"}
+        return {
+            f"energy_{name}": found[name] * model.units.energy
+            for name in ENERGIES
+            if name not in absent
+        }
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Stress-free shape, turns, spins and accelerations of the nodes."""
+        arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        return arrays | (self.contacts.saved() if self.contacts is not None else {})
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take over what `saved` returned."""
+        for name in _CARRIED:
+            getattr(self, name).assign(arrays[f"bonds_{name}"])
+        self.started = True
+        if self.contacts is not None:
+            self.contacts.restore(arrays, self.step_count)
+            self._stop_executor()
+
+    def torn_fiber(self) -> dict[str, Any]:
+        """First torn fiber, its worst node, and the pull (N) of its longest bond."""
+        found = super().torn_fiber()
+        return found | {
+            "terms": {"stretching": found["terms"]["stretching"]},
+            "largest_term": "stretching",
+        }

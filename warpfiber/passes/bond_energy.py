@@ -1,0 +1,111 @@
+"""Energies of fibers made of bonded spheres: a device sweep that only reads, and its sums.
+
+One thread per fiber writes that fiber's energies; the host adds them in the order of the fibers.
+Source: laws `bond` and `hertz`; weight is potential against the middle of the box, or of the start.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.laws.bond import make_bond
+from warpfiber.laws.hertz import make_hertz
+from warpfiber.model import precision
+from warpfiber.passes.bond_groups import bond_group_struct
+
+# Columns; those of walls are zero without them.
+ENERGIES = ("kinetic", "stretching", "shear", "bending", "twist", "gravity", "wall")
+
+
+@cache
+def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
+    """Kernel `measure_bonds`: energies (F, len(ENERGIES)) of the present state."""
+    p = precision(name)
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    BondGroup = bond_group_struct(name)
+    _, bond_energies, _ = make_bond(name)
+    _, _, plane_energy = make_hertz(name)
+    wall_x, wall_y, wall_z = walls
+    has_walls = any(walls)
+
+    @wp.func
+    def walls_energy(g: BondGroup, x: wp.vec3d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
+        energy = wp.float64(0.0)
+        for axis in range(3):
+            has_wall = wp.static(wall_x)
+            if axis == 1:
+                has_wall = wp.static(wall_y)
+            if axis == 2:
+                has_wall = wp.static(wall_z)
+            if has_wall:
+                below = g.radius - real(x[axis] - low[axis])
+                above = g.radius - real(high[axis] - x[axis])
+                energy += wp.float64(plane_energy(g.wall_modulus, g.radius, below))
+                energy += wp.float64(plane_energy(g.wall_modulus, g.radius, above))
+        return energy
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def measure_bonds(
+        wall_low: wp.vec3d,
+        wall_high: wp.vec3d,
+        groups: wp.array(dtype=BondGroup),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        bond_axis: wp.array(dtype=vec3),
+        bond_length: wp.array(dtype=real),
+        place: wp.array(dtype=wp.vec3d),
+        node_velocity: wp.array(dtype=vec3),
+        node_turn: wp.array(dtype=vec4),
+        node_spin: wp.array(dtype=vec3),
+        energies_out: wp.array2d(dtype=wp.float64),
+    ):
+        fiber = wp.tid()
+        g = groups[fiber_group[fiber]]
+        first = fiber_node_start[fiber]
+        last = fiber_node_start[fiber + 1] - 1
+        middle = wp.float64(0.5) * (wall_low + wall_high)
+        half = wp.float64(0.5)
+        kinetic = wp.float64(0.0)
+        gravity = wp.float64(0.0)
+        wall = wp.float64(0.0)
+        bonds = wp.vec4d()
+        for i in range(first, last + 1):
+            mass = wp.float64(g.mass)
+            inertia = wp.float64(g.inertia)
+            if (i == first or i == last) and g.closed == 0:
+                mass = wp.float64(g.end_mass)
+                inertia = wp.float64(g.end_inertia)
+            moving = mass * wp.length_sq(wp.vec3d(node_velocity[i]))
+            kinetic += half * (moving + inertia * wp.length_sq(wp.vec3d(node_spin[i])))
+            gravity -= mass * wp.dot(wp.vec3d(g.weight), place[i] - middle)
+            if wp.static(has_walls):
+                wall += walls_energy(g, place[i], wall_low, wall_high)
+            j = i + 1
+            if i == last:
+                j = first
+            if i < last or g.closed == 1:
+                d = vec3(place[j] - place[i])
+                bonds += wp.vec4d(
+                    bond_energies(
+                        g.stiffness, bond_axis[i], bond_length[i], d, node_turn[i], node_turn[j]
+                    )
+                )
+        energies_out[fiber, 0] = kinetic
+        for part in range(4):
+            energies_out[fiber, part + 1] = bonds[part]
+        energies_out[fiber, 5] = gravity
+        energies_out[fiber, 6] = wall
+
+    return measure_bonds
+
+
+def measure_bond_energies(
+    name: str, walls: tuple[bool, bool, bool], fibers: int, inputs: list[Any], device: str
+) -> dict[str, float]:
+    """Sums of all ENERGIES over the fibers, run units."""
+    energies = wp.zeros((fibers, len(ENERGIES)), dtype=wp.float64, device=device)
+    kernel = make_measure_bonds(name, walls)
+    wp.launch(kernel, dim=fibers, inputs=[*inputs, energies], device=device)
+    return dict(zip(ENERGIES, np.sum(energies.numpy(), axis=0).tolist(), strict=True))

@@ -1,0 +1,172 @@
+"""The blocks of `chain_blocks` for the CPU: a SIMD vector of ends at a time.
+
+A lane is an end with a unit force; the two solves of `chain_reply` run on all lanes at once and
+fill as many columns of the block. A block is stored with whole vectors per end, so that an update
+is a few products of vectors.
+Symbols: as in `chain_reply`; T, W, V, U, V3 from `native.lane_types`; z displacements and b
+    impulses of the nodes, `at` the node before the end, `share` the part of the force on the next.
+Limits: fibers of up to MOST_NODES nodes (stack); sums are in another order than in `chain_reply`
+    and multiplications and additions are fused: equal to rounding.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfiber.model import precision
+from warpfiber.passes.elimination import elimination_row
+from warpfiber.passes.native import lane_types
+
+MOST_NODES = 512
+
+FILL_BLOCK = """
+    const int count = end - begin, width = (count + W - 1) / W * W;
+    T* const columns = block.data + column;
+    V3 z[MOST_NODES];
+    V b[MOST_NODES];
+    auto times = [&](const auto& row, const V3& v) -> V3 {
+        const auto& d = row.diagonal;
+        const auto& o = row.off;
+        return V3{d[0] * v.x + o[0] * v.y + o[1] * v.z, o[0] * v.x + d[1] * v.y + o[2] * v.z,
+                  o[1] * v.x + o[2] * v.y + d[2] * v.z};
+    };
+    auto along = [](const auto& u, const V3& v) -> V {
+        return u[0] * v.x + u[1] * v.y + u[2] * v.z;
+    };
+    auto same = [](const auto& u) -> V3 { return V3{V(u[0]), V(u[1]), V(u[2])}; };
+    const V3 none = same3(T(0), T(0), T(0));
+    for (int group = 0; group < count; group += W) {
+        V at = V(T(-9)), share = V(T(0));
+        V3 push = none;
+        for (int l = 0; l < W && group + l < count; ++l) {
+            const int r = end_row.data[begin + group + l];
+            const bool own = group + l < owned;
+            const auto& n = row_normal.data[r];
+            at[l] = T(row_node.data[r][own ? 0 : 1] - first);
+            share[l] = own ? row_s.data[r] : row_t.data[r];
+            push.x[l] = own ? -n[0] : n[0];
+            push.y[l] = own ? -n[1] : n[1];
+            push.z[l] = own ? -n[2] : n[2];
+        }
+        for (int stage = 0; stage < 2; ++stage) {
+            V3 y1 = none, v1 = none, v2 = none, couple = none, z0 = none, z1 = none;
+            V yt1 = V(T(0));
+            if (stage == 1) z1 = z[0];
+            for (int k = 0; k <= segments; ++k) {
+                const auto& row = rows.data[base + k];
+                const V part = at == V(T(k)) ? T(1) - share
+                    : (at == V(T(k - 1)) ? share : V(T(0)));
+                V3 r = push * (h * part);
+                if (stage == 1) {
+                    const T drag = k == 0 || k == segments ? drag_end : drag_inner;
+                    r = r + z1 * V(drag) + z0 * V(drag_off) + couple;
+                    if (k < segments) {
+                        const V3 z2 = z[k + 1], turn = z2 - z1;
+                        const T s = strength * (weight + (k == 0 ? weight_excess : T(0))
+                            + (k == segments - 1 ? weight_excess : T(0)));
+                        couple = (turn - same(row.axis) * along(row.axis, turn)) * V(s);
+                        r = r + z2 * V(drag_off) - couple;
+                        z0 = z1;
+                        z1 = z2;
+                    }
+                }
+                V3 y = r - V3{along(row.l0, y1), along(row.l1, y1), along(row.l2, y1)};
+                y = y - same(row.lt) * yt1 - v2 * V(kappa);
+                const V yt = k == 0 ? V(T(0)) : along(rows.data[base + k - 1].axis, v1);
+                v2 = v1;
+                v1 = times(row, y) + same(row.q) * yt;
+                z[k] = v1;
+                b[k] = along(row.q, y) + yt * row.s;
+                y1 = y;
+                yt1 = yt;
+            }
+            V3 behind = none, beyond = none;
+            V impulse = V(T(0));
+            for (int k = segments; k >= 0; --k) {
+                const auto& row = rows.data[base + k];
+                V3 p = none;
+                if (k < segments) p = same(row.axis) * impulse - beyond * V(kappa);
+                V3 x = z[k] + times(row, p);
+                V whole = b[k] + along(row.q, p);
+                if (k < segments) {
+                    const auto& next = rows.data[base + k + 1];
+                    x = x - same(next.l0) * behind.x - same(next.l1) * behind.y
+                        - same(next.l2) * behind.z;
+                    whole = whole - along(next.lt, behind);
+                }
+                impulse = whole;
+                beyond = behind;
+                behind = x;
+                z[k] = x;
+            }
+        }
+        for (int e = 0; e < count; ++e) {
+            const int r = end_row.data[begin + e];
+            const bool own = e < owned;
+            const T t = own ? row_s.data[r] : row_t.data[r];
+            const int k = row_node.data[r][own ? 0 : 1] - first;
+            const V move = along(row_normal.data[r], z[k] * V(T(1) - t) + z[k + 1] * V(t));
+            *(U*)(columns + (long)e * width + group) = own ? -move : move;
+        }
+    }
+"""
+
+MOVE_ENDS = """
+    const int count = end - begin, width = (count + W - 1) / W * W;
+    const T* const columns = block.data + column;
+    for (int group = 0; group < count; group += W) {
+        V move = V(T(0));
+        for (int e = 0; e < count; ++e)
+            move += end_force.data[begin + e] * *(const U*)(columns + (long)e * width + group);
+        for (int l = 0; l < W && group + l < count; ++l)
+            end_move.data[begin + group + l] = move[l];
+    }
+"""
+
+
+@cache
+def make_native_blocks(name: str) -> Any:
+    """`fill_block` of one fiber, and `move_ends` by the forces `end_force`."""
+    p = precision(name)
+    real, vec3 = p.real, p.vec3
+    Row = elimination_row(name)
+    types = lane_types(name)
+
+    @wp.func_native(types + FILL_BLOCK.replace("MOST_NODES", str(MOST_NODES)))
+    def fill_block(
+        first: wp.int32,
+        segments: wp.int32,
+        base: wp.int32,
+        begin: wp.int32,
+        end: wp.int32,
+        owned: wp.int32,
+        column: wp.int32,
+        h: real,
+        kappa: real,
+        drag_end: real,
+        drag_inner: real,
+        drag_off: real,
+        strength: real,
+        weight: real,
+        weight_excess: real,
+        rows: wp.array(dtype=Row),
+        row_node: wp.array(dtype=wp.vec2i),
+        row_s: wp.array(dtype=real),
+        row_t: wp.array(dtype=real),
+        row_normal: wp.array(dtype=vec3),
+        end_row: wp.array(dtype=wp.int32),
+        block: wp.array(dtype=real),
+    ): ...
+
+    @wp.func_native(types + MOVE_ENDS)
+    def move_ends(
+        begin: wp.int32,
+        end: wp.int32,
+        column: wp.int32,
+        block: wp.array(dtype=real),
+        end_force: wp.array(dtype=real),
+        end_move: wp.array(dtype=real),
+    ): ...
+
+    return fill_block, move_ends
