@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import warpfiber as wf
-from tests.papers.test_sasayama_2018 import half_turn, tips
+from tests.turning import half_turn, tips
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes" / "sasayama_2018"
 pytestmark = pytest.mark.papers
@@ -84,6 +84,6 @@ def test_cell_agrees_with_the_published_scheme(name: str, method: str) -> None:
     shipped = wf.load_scene(SCENES / f"{name}.toml")
     assert shipped.numerics.method == method
     explicit = wf.load_scene(SCENES / f"{name}.toml", {"numerics.method": "bead_chain"})
-    fibers = shipped.fibers[0].count_achieved
+    fibers = shipped.fibers[0].count
     bound = 2.0 * SCATTER * np.sqrt(200.0 / fibers)
     assert late_a11(shipped) == pytest.approx(late_a11(explicit), abs=bound)

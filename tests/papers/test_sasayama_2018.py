@@ -13,26 +13,13 @@ import pytest
 
 import warpfiber as wf
 from tests.reference.flexible import flexible_chain, run_flexible
+from tests.turning import half_turn, tips
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes" / "sasayama_2018"
 pytestmark = pytest.mark.papers
 
 # Error of the period without correction in percent (rigid chain of touching beads, exact).
 UNCORRECTED = {1: -75.63, 3: -74.32, 9: -65.31, 11: -62.64, 33: -40.51}
-
-
-def half_turn(simulation: wf.Simulation) -> float:
-    """Strain at which the end-to-end vector passes -x (cubic through four samples)."""
-    strain, angle = [0.0], [0.0]
-    while len(angle) < 5 or angle[-3] > -np.pi:
-        simulation.run(until=simulation.strain + 0.2)
-        axis = simulation.node_pos[-1] - simulation.node_pos[0]
-        step = np.arctan2(axis[2], axis[0]) - angle[-1]
-        strain.append(simulation.strain)
-        angle.append(angle[-1] + (step + np.pi) % (2.0 * np.pi) - np.pi)
-        assert strain[-1] < 400.0, "the fiber does not turn"
-    fit = np.polyfit(np.array(angle[-5:-1]) + np.pi, np.array(strain[-5:-1]), 3)
-    return float(np.polyval(fit, 0.0))
 
 
 def period(segments: int, closure: str) -> float:
@@ -84,21 +71,6 @@ def tip_curve(segments: int, closure: str, fraction: float, strains: np.ndarray)
         "numerics.dt_fraction": fraction,
     }
     return tips(wf.load_scene(SCENES / "flexible.toml", overrides), strains)
-
-
-def tips(scene: wf.Scene, strains: np.ndarray) -> np.ndarray:
-    """x/L, z/L of the last node at the given strains, (K, 2)."""
-    simulation = wf.Simulation(scene)
-    found = []
-    for strain in strains:
-        simulation.run(until=float(strain))
-        # the step ends up to one dt past the mark
-        late = (simulation.strain - strain) / scene.flow.rate
-        nodes = simulation.node_pos - late * simulation.node_velocity
-        tip = nodes[-1] - nodes.mean(axis=0)
-        found.append(tip[[0, 2]] / scene.fibers[0].centerline_length)
-    simulation.close()
-    return np.array(found)
 
 
 @pytest.mark.parametrize(
