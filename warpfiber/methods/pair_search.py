@@ -19,6 +19,8 @@ from warpfiber.model import PAIR_COUNT, Model, State
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
 
+# as PAIR_COST: the rows and the check of an implicit step look at every listed pair
+STEP_PAIR_COST = 16.0
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1
 
@@ -75,6 +77,7 @@ class PairSearch:
             core=2.0 * min(row["radius"] for row in rows),
             length=float(np.average([row["rest"] for row in rows], weights=segments)),
             pieces_per_segment=pairs.piece_count / self.model.segment_count,
+            pair_cost=STEP_PAIR_COST,
             fixed=self.scene.numerics.skin is not None,
         )
 
