@@ -109,15 +109,22 @@ def _run(keys: Keys, args: argparse.Namespace, common: Common) -> dict[str, Any]
     wall, cpu, rows, part = 0.0, 0.0, [], (0.0, 0.0)
     half = 0.5 * args.strain
     marks = [*np.arange(1.0, half, 1.0), *np.arange(half, args.strain + 1e-9, SAMPLE)]
+    failure = None
     for mark in marks:
         begin, before = time.perf_counter(), time.process_time()
-        simulation.run(until=float(mark))
+        try:
+            simulation.run(until=float(mark))
+        except wf.Diverged as found:
+            failure = str(found)
+            break
         wall += time.perf_counter() - begin
         cpu += time.process_time() - before
         if mark >= half:
             rows.append(simulation.measure())
         if mark <= args.explicit + 1e-9:
             part = wall / simulation.strain, cpu / simulation.strain
+    if not rows:
+        rows.append(simulation.measure())
     touching = sum(row["contacts_per_fiber"] for row in rows)
     overlap = sum(row["contacts_per_fiber"] * row["overlap_mean"] for row in rows)
     report = simulation.method.step_report()
@@ -141,7 +148,11 @@ def _run(keys: Keys, args: argparse.Namespace, common: Common) -> dict[str, Any]
         "overlap_mean": float(overlap / max(touching, 1e-300)),
     }
     simulation.close()
-    return found
+    return (
+        found
+        if failure is None
+        else found | {"diverged": failure, "strain": round(simulation.strain, 3)}
+    )
 
 
 def _against(row: dict[str, Any], exact: float) -> dict[str, Any]:

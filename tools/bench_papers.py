@@ -12,6 +12,7 @@ from machine import SCENES
 
 import warpfiber as wf
 from warpfiber.scene.derived import jeffery_period
+from warpfiber.trial import after_trial
 
 # Scene -> segments of the reduced chain; every cell also runs as the full chain.
 CELLS = {
@@ -94,7 +95,7 @@ def suspension_rows(args: argparse.Namespace, common: Common) -> Iterator[dict[s
                 key = "segments" if segments else "reduced_beads"
                 keys = {"numerics.method": args.method, f"numerics.{key}": segments}
                 overrides = {"seed": seed} | keys | dict(args.set)
-                scene = wf.load_scene(SCENES / f"{name}.toml", overrides)
+                scene = after_trial(wf.load_scene(SCENES / f"{name}.toml", overrides), args.workers)
                 yield suspension(scene, args, common)
 
 

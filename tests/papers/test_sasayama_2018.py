@@ -13,6 +13,7 @@ import pytest
 
 import warpfiber as wf
 from tests.reference.flexible import flexible_chain, run_flexible
+from tests.turning import half_turn, tips
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes" / "sasayama_2018"
 pytestmark = pytest.mark.papers
@@ -21,22 +22,8 @@ pytestmark = pytest.mark.papers
 UNCORRECTED = {1: -75.63, 3: -74.32, 9: -65.31, 11: -62.64, 33: -40.51}
 
 
-def half_turn(simulation: wf.Simulation) -> float:
-    """Strain at which the end-to-end vector passes -x (cubic through four samples)."""
-    strain, angle = [0.0], [0.0]
-    while len(angle) < 5 or angle[-3] > -np.pi:
-        simulation.run(until=simulation.strain + 0.2)
-        axis = simulation.node_pos[-1] - simulation.node_pos[0]
-        step = np.arctan2(axis[2], axis[0]) - angle[-1]
-        strain.append(simulation.strain)
-        angle.append(angle[-1] + (step + np.pi) % (2.0 * np.pi) - np.pi)
-        assert strain[-1] < 400.0, "the fiber does not turn"
-    fit = np.polyfit(np.array(angle[-5:-1]) + np.pi, np.array(strain[-5:-1]), 3)
-    return float(np.polyval(fit, 0.0))
-
-
 def period(segments: int, closure: str) -> float:
-    """Period of the shipped scene in strain, 2 t_1."""
+    """Period by the published scheme in strain, 2 t_1."""
     overrides = {
         "numerics.method": "bead_chain",
         "numerics.segments": segments,
@@ -76,25 +63,14 @@ def test_uncorrected_period(segments: int, full_period: float) -> None:
 
 
 def tip_curve(segments: int, closure: str, fraction: float, strains: np.ndarray) -> np.ndarray:
-    """x/L, z/L of the last node of the shipped flexible fiber at the given strains, (K, 2)."""
+    """x/L, z/L of the last node at the given strains by the published scheme, (K, 2)."""
     overrides = {
         "numerics.method": "bead_chain",
         "numerics.segments": segments,
         "numerics.closure": closure,
         "numerics.dt_fraction": fraction,
     }
-    scene = wf.load_scene(SCENES / "flexible.toml", overrides)
-    simulation = wf.Simulation(scene)
-    tips = []
-    for strain in strains:
-        simulation.run(until=float(strain))
-        # the step ends up to one dt past the mark
-        late = (simulation.strain - strain) / scene.flow.rate
-        nodes = simulation.node_pos - late * simulation.node_velocity
-        tip = nodes[-1] - nodes.mean(axis=0)
-        tips.append(tip[[0, 2]] / scene.fibers[0].centerline_length)
-    simulation.close()
-    return np.array(tips)
+    return tips(wf.load_scene(SCENES / "flexible.toml", overrides), strains)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +82,8 @@ def test_flexible_fiber_at_half_the_stable_step(segments: int, closure: str) -> 
     run = run_flexible(chain, dt=2e-3, strain_end=60.0)
     strains = np.arange(1.0, 60.5, 1.0)
     expected = np.array([[run.at(run.tip[:, k], s) for k in (0, 2)] for s in strains])
-    tips = tip_curve(segments, closure, 0.5, strains)
-    assert np.abs(tips - expected).max() < 1e-3
+    found = tip_curve(segments, closure, 0.5, strains)
+    assert np.abs(found - expected).max() < 1e-3
 
 
 def test_reduced_flexible_fibers_agree_with_the_full_chain() -> None:

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def late_orientation(name: str, seed: int, **numerics: object) -> tuple[float, float]:
-    """Mean A_xx and interactions per fiber over strain 30-60."""
+    """Mean A_xx and interactions per fiber over strain 30-60 by the published scheme."""
     overrides = {f"numerics.{key}": value for key, value in numerics.items()}
     overrides |= {"seed": seed, "numerics.method": "bead_chain"}
     simulation = wf.Simulation(wf.load_scene(SCENES / f"{name}.toml", overrides))
