@@ -238,4 +238,9 @@ class Method(ABC):
             "terms": dict(zip(TERMS, map(float, sizes), strict=True)),
             "largest_term": TERMS[largest],
             "stretch": float(mine[worst]),
+            "contact": self.refused_contact(),
         }
+
+    def refused_contact(self) -> dict[str, Any] | None:
+        """What two fibers did that no step could prevent; None if contact is not the cause."""
+        return None

@@ -39,14 +39,16 @@ class ContactCheck:
         node_back: Any,
         lattice_back: Any,
         lattice_now: Any,
+        fiber_frozen: Any = None,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
         self.node_back = node_back
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         domain, name = model.domain, model.precision.name
-        self.kernels = dict(
-            make_check_sweeps(name, CheckFeatures(any(domain.periodic), domain.wall))
-        )
+        none = wp.zeros(0, dtype=wp.uint8, device=model.device)
+        self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
+        features = CheckFeatures(any(domain.periodic), domain.wall, fiber_frozen is not None)
+        self.kernels = dict(make_check_sweeps(name, features))
         self.kernels |= make_list_bound(name)
         segments = model.segment_count
         self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
@@ -81,6 +83,7 @@ class ContactCheck:
             model.fiber_group,
             model.segment_node,
             model.segment_fiber,
+            self.fiber_frozen,
             pairs.out_start,
             pairs.pair_j,
             pairs.pair_image,
