@@ -17,7 +17,7 @@ def rod_scene(rods: Sequence[Rod], *, quantities: Sequence[str] = (), **tables: 
     """Scene with one group per rod; `tables` override box (open), contact, stage, numerics, ..."""
     numerics = {
         "method": "bonded_spheres",
-        "segments": [len(rod.rest) - 1 for rod in rods],
+        "segments": [len(rod.first) for rod in rods],
         "bond_shear": rods[0].shear,
         "device": "cpu",
         **tables.pop("numerics", {}),
@@ -28,7 +28,7 @@ def rod_scene(rods: Sequence[Rod], *, quantities: Sequence[str] = (), **tables: 
         "fibers": [
             {
                 "count": 1,
-                "centerline_length": rod.length * (len(rod.rest) - 1),
+                "centerline_length": rod.length * len(rod.first),
                 "diameter": 2.0 * rod.radius,
                 "density": rod.density,
                 "youngs_modulus": rod.modulus,
@@ -36,6 +36,7 @@ def rod_scene(rods: Sequence[Rod], *, quantities: Sequence[str] = (), **tables: 
                 "bond_damping": rod.damping,
                 "position": [0.01, 0.01, 0.01],
                 "orientation": "aligned",
+                **({"shape": {"kind": "ring"}} if rod.closed else {}),
             }
             for rod in rods
         ],

@@ -76,7 +76,7 @@ def _group_row(scene: Scene, group: FiberGroup, units: Units) -> dict[str, Any]:
         "weight_excess": 0.5 if scene.numerics.torque_weights == "end_weighted" else 0.0,
         "body_force": gravity,
         "coupling": galerkin_entries(m)[2],
-        "segments": group.segments,
+        "segments": group.segments - (group.shape.kind == "ring"),  # the closing one is not listed
         "inner_beads": inner,
         "bead_weight": reduced / inner if inner else 0.0,
     }

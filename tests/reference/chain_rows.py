@@ -80,15 +80,34 @@ def is_nearest(point: Array, side: Side, t: float, a: float) -> bool:
     if side.previous is not None:
         before = Side(side.previous, side.start)
         back = 1.0 - before.nearest(point)
-        # in a hollow two places are nearest: the first of those within one radius counts
-        return not (back > END and back * before.length + t * side.length < SAME_ARC * a)
+        if hidden(back, back * before.length, t * side.length, a, first=True):
+            return False
+    if side.following is not None:
+        after = Side(side.end, side.following)
+        ahead = after.nearest(point)
+        return not hidden(ahead, ahead * after.length, (1.0 - t) * side.length, a, first=False)
     return True
+
+
+def hidden(fraction: float, away: float, along: float, a: float, first: bool) -> bool:
+    """In a hollow two places are nearest: of those within one radius, the further from the joint.
+
+    That one is nearer to the point. `away`, `along`: of the other place and this one from the joint.
+    """
+    wins = away >= along if first else away > along
+    return fraction > END and away + along < SAME_ARC * a and wins
 
 
 def same(p: tuple[float, float], q: tuple[float, float], i: Side, j: Side, a: float) -> bool:
     """Whether two places are within one radius along both segments."""
     apart = max(abs(p[0] - q[0]) * i.length, abs(p[1] - q[1]) * j.length)
     return bool(apart < SAME_ARC * a)
+
+
+def nearer(p: tuple[float, float], q: tuple[float, float], i: Side, j: Side) -> bool:
+    """Whether two points are nearer, by more than a thousandth, than two others."""
+    found = [float(np.linalg.norm(j.at(t) - i.at(s))) for s, t in (p, q)]
+    return found[0] < 0.999 * found[1]
 
 
 def beside_next(i: Side, j: Side, t: float, a: float) -> bool:
@@ -120,7 +139,8 @@ def counted_places(i: Side, j: Side, a: float) -> dict[int, tuple[float, float]]
         if k == 4 and not j.first:
             continue
         earlier = [*open_ends.values(), *([top] if 0 in found else [])]
-        if any(same(st, other, i, j, a) for other in earlier):
+        beside = [other for other in earlier if same(st, other, i, j, a)]
+        if any(0 in found or not nearer(st, other, i, j) for other in beside):
             continue
         if is_nearest(j.at(st[1]), i, st[0], a) and not (k == 3 and beside_next(j, i, st[0], a)):
             found[k] = st

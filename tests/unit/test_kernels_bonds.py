@@ -147,3 +147,39 @@ def test_loads_and_held_nodes() -> None:
     assert np.abs(moved[3]).max() == 0.0
     turns = held.method.node_turn.numpy()  # type: ignore[attr-defined]
     assert np.abs(turns[0] - state["q"][0]).max() < 1e-15
+
+
+def test_rings() -> None:
+    """Two rings with a bond from the last node to the first, and 100 steps of them."""
+    rng = np.random.default_rng(9)
+    rods, parts = [], []
+    for n in (12, 9):
+        angle = 2.0 * np.pi * np.arange(n) / n
+        radius = 2.5e-3 * n / (2.0 * np.pi)
+        rest = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1) + 0.5
+        rods.append(ref.Rod(rest, 1.2e-3, closed=True, damping=0.1, segment_length=2.5e-3))
+        shape = rest.shape
+        parts.append(
+            {
+                "x": rest + 1e-5 * rng.normal(size=shape),
+                "v": 0.1 * rng.normal(size=shape),
+                "q": ref.exponential(0.05 * rng.normal(size=shape)),
+                "w": 20.0 * rng.normal(size=shape),
+            }
+        )
+    state = {key: np.concatenate([part[key] for part in parts]) for key in "xvqw"}
+    sim = start_rods(rods, **state, quantities=["energy", "orientation"])
+    motions = [ref.start(rod, **part) for rod, part in zip(rods, parts, strict=True)]
+    for mine, name in zip(rates(sim), "ab", strict=True):
+        theirs = np.concatenate([getattr(motion, name) for motion in motions])
+        assert np.abs(mine - theirs).max() < 2.2e-11 * np.abs(theirs).max()
+    for rod, motion in zip(rods, motions, strict=True):
+        for _ in range(100):
+            ref.step(rod, motion, sim.dt)
+    sim.step(100)
+    expected = np.concatenate([motion.x for motion in motions])
+    assert np.abs(sim.node_pos - expected).max() < 1e-9 * np.abs(expected - state["x"]).max()
+    row = sim.measure()
+    bonds = sum(row[f"energy_{part}"] for part in ("stretching", "shear", "bending", "twist"))
+    energy = sum(ref.bond_energy(r, m.x, m.q).sum() for r, m in zip(rods, motions, strict=True))
+    assert bonds == pytest.approx(energy, rel=1e-8)

@@ -13,6 +13,8 @@ from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
 
+REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
+
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
 
@@ -68,6 +70,7 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         p.real(dt),
         p.real(spheres.scene.contact.damping),
         p.real(spheres.scene.contact.friction),
+        p.real(REACH_MARGIN * pairs.reach),
         spheres.groups,
         model.fiber_node_start,
         model.fiber_group,

@@ -131,7 +131,7 @@ class BondedSpheres(Method):
         row.wall_modulus = c.wall_modulus / stress
         row.compliance = c.compliance * stress
         row.shear_compliance = c.shear_compliance * stress
-        row.segments = group.segments
+        row.segments = group.segments - is_closed(group)  # without a ring's closing one
         row.torn_length = TEAR_STRETCH * c.segment_length / units.length
         row.closed = int(is_closed(group))
         return row

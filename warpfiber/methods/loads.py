@@ -33,7 +33,7 @@ def node_loads(scene: Scene, model: Model) -> tuple[np.ndarray, np.ndarray]:
             load[node_group == row.group] = velocity
             continue
         fibers = np.flatnonzero(group_of == row.group)
-        nodes = scene.fibers[row.group].segments + 1
+        nodes = int(np.diff(start)[fibers[0]])
         for key, index, count in (("fiber", row.fiber, len(fibers)), ("node", row.node, nodes)):
             if not -count <= index < count:
                 remedy = f"the group has {count} per {'group' if key == 'fiber' else 'fiber'}"

@@ -200,6 +200,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         dt: real,
         beta: real,
         friction: real,
+        largest_reach: real,
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -233,24 +234,30 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         for k in range(out_start[i], out_start[i + 1]):
             j = pair_j[k]
             node_j = segment_node[j]
-            fiber_j = segment_fiber[j]
-            gj = groups[fiber_group[fiber_j]]
             xj = place[node_j]
             b = vec3(place[node_j + 1] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
-            reach = gi.radius + gj.radius
             push = vec4(zero, zero, zero, zero)
-            if wp.length_sq(c) < reach * reach:
-                at_j = node_j - fiber_node_start[fiber_j]
-                push = normal_contact(gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos)
+            # most listed pairs end here: the constants of their groups are not even read
+            if wp.length_sq(c) < largest_reach * largest_reach:
+                fiber_j = segment_fiber[j]
+                other = groups[fiber_group[fiber_j]]
+                reach = gi.radius + other.radius
+                if wp.length_sq(c) < reach * reach:
+                    at = node_j - fiber_node_start[fiber_j]
+                    push = normal_contact(
+                        gi, other, at_i, at, node_i, node_j, delta, a, b, st, node_pos
+                    )
             if push[0] <= zero:
                 if pair_acts[k] != wp.uint8(0):
                     pair_acts[k] = wp.uint8(0)
                     if wp.static(has_friction):
                         pair_stiffness[k] = zero
                 continue
+            gj = groups[fiber_group[segment_fiber[j]]]
+            at_j = node_j - fiber_node_start[segment_fiber[j]]
             s = push[2]
             t = push[3]
             c = delta + t * b - s * a
@@ -265,10 +272,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 v_j, w_j = node_between(t, node_j, node_velocity, node_spin)
                 slip = v_i - v_j + wp.cross(arm_i * w_i + arm_j * w_j, n)
                 approach = wp.dot(slip, n)
-                mass = one / (
-                    inverse_mass(gi, at_i, s)
-                    + inverse_mass(gj, node_j - fiber_node_start[fiber_j], t)
-                )
+                mass = one / (inverse_mass(gi, at_i, s) + inverse_mass(gj, at_j, t))
                 if wp.static(has_dashpot):
                     resistance = dashpot * beta * wp.sqrt(push[1] * mass)
                     size = wp.max(size + resistance * approach, zero)

@@ -5,7 +5,7 @@ the nearest point of segment j, 3 and 4 those of j against i. The ends of an ove
 parallel fibers block the turning about a single point.
 
 Source: closed forms on lines. A row within one radius of a row already kept, along both fibers, is
-    left out. In a chain a joint belongs to the segment that ends there, so that it gives one row
+    left out, unless it is nearer. In a chain a joint belongs to the segment that ends there, so that it gives one row
     per place of the other fiber that is nearest to it, whatever number of segments meet.
 Symbols: D = `delta` from the start of a to the start of b, s and t fractions of a and b; relative
     motion over the step w(s, t) = w_0 + t w_b - s w_a; gap g = |c| - a_i - a_j, c = D + t b - s a.
@@ -22,6 +22,7 @@ from warpfiber.passes.pairs import END_TOLERANCE
 SLOTS = 5
 PARALLEL = 1e-9  # sin^2 of the angle below which closest points are not unique
 # Distance (run units) below which rounding decides on the direction between closest points.
+CLOSER = 0.999  # a place stands for one beside it unless that is nearer, by more than this share
 CROSSING = {"float32": 1e-5, "float64": 1e-12}
 
 
@@ -61,6 +62,7 @@ def make_row_geometry(name: str):
     zero, one = real(0.0), real(1.0)
     near = real(END_TOLERANCE[name])
     crossing = real(CROSSING[name])
+    closer = real(CLOSER * CLOSER)
 
     @wp.func
     def largest_motion(w: vec3, wa: vec3, wb: vec3) -> real:
@@ -127,7 +129,7 @@ def make_row_geometry(name: str):
         """Whether t is a place of its fiber that is nearest to a point, counted only here.
 
         `apart`: from the point to the place, which lies on `edge`. Of the two places on the hollow
-        side of a joint that are within `arc` the first counts.
+        side of a joint that are within `arc` the nearer counts, which is further from the joint.
         """
         if t <= near and at > 0:
             return False
@@ -139,7 +141,16 @@ def make_row_geometry(name: str):
             before = nodes[node] - nodes[node - 1]
             size2 = wp.dot(before, before)
             back = wp.dot(apart - t * edge, before) / size2
-            if back > near and back * wp.sqrt(size2) + along < arc:
+            away = back * wp.sqrt(size2)
+            if back > near and away + along < arc and away >= along:
+                return False
+        along = (one - t) * wp.length(edge)
+        if at < segments - 1 and along < arc:
+            following = nodes[node + 2] - nodes[node + 1]
+            size2 = wp.dot(following, following)
+            ahead = -wp.dot(apart + (one - t) * edge, following) / size2
+            away = ahead * wp.sqrt(size2)
+            if ahead > near and away + along < arc and away > along:
                 return False
         return True
 
@@ -228,8 +239,13 @@ def make_row_geometry(name: str):
             other = row_fractions(end, delta, a, b)
             if is_same(place, other, length_a, length_b, arc):
                 # made by whichever segment owns the node, unless the closest points stand for it
-                if not (has_first and is_same(other, st, length_a, length_b, arc)):
-                    return False
+                if has_first:
+                    if not is_same(other, st, length_a, length_b, arc):
+                        return False
+                else:
+                    beside = delta + other[1] * b - other[0] * a
+                    if wp.length_sq(c) >= closer * wp.length_sq(beside):
+                        return False
         if not is_nearest(place[0], -c, a, arc, node_i, at_i, segments_i, nodes):
             return False
         if slot == 3 and at_j < segments_j - 1:

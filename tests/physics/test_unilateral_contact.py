@@ -1,4 +1,4 @@
-"""Steps with contact against restatements made from dense matrices, and where contacts rest.
+"""Steps with contact against restatements made from dense matrices.
 
 Source: predictor without contact, rows at the start of the step, dual problem, response. Rods by
     `reference.unilateral`; flexible fibers by SDIRK2, their response to a constant force by two
