@@ -179,10 +179,10 @@ def test_skin_follows_the_motion(start: Start) -> None:
 def test_report_of_builds_and_skins(start: Start) -> None:
     """Mean skin over the steps taken, steps per build; a continued run counts its own steps."""
     kind = Kind(2, 4.0, modulus=3000.0)
-    fibers, _ = random_fibers((kind,), 60, [34.0] * 3, seed=44, spread=5.0)
+    fibers, _ = random_fibers((kind,), 60, [50.0] * 3, seed=44, spread=5.0)
 
     def begin() -> Simulation:
-        box = {"size": [34.0] * 3}
+        box = {"size": [50.0] * 3}
         return cell(start, (kind,), fibers, flow=SHEAR, box=box, numerics={"dt": 4e-3})
 
     run, skins = begin(), []

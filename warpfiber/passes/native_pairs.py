@@ -76,7 +76,7 @@ NEAR_PAIRS = Template("""
     };
     auto any = [&](auto test) { return bits(test) != 0; };
     const int none = $none;
-    auto shift_of = [&](int k) __attribute__((noinline)) {
+    auto shift_of = [&](int k) {
         int code = pair_image.data[k];
         auto number = [&](int place) { return real(((code >> place) & $mask) - $half); };
         wp::vec_t<3, real> n(number(0), number($bits), number(2 * $bits));
