@@ -133,10 +133,11 @@ class PairSearch:
         wanted = SPARE * slid * longer * self.skin.skin / before
         return max(0.0, min(wanted, 0.5 * (self._room() - self.skin.skin)))
 
-    def use_up(self, step: int, use: np.ndarray) -> bool:
+    def use_up(self, step: int, use: np.ndarray | None = None) -> bool:
         """Choose the next skin, the present one being used up; False if none would last a step.
 
-        `use`: what the list was used up by, see `passes.list_bound`.
+        `use`: what the list was used up by, see `passes.list_bound`; without it no segment is
+        listed longer than it is.
         """
         listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
         short = step <= self.skin.built_step and self.list.build_count > 0
@@ -147,15 +148,18 @@ class PairSearch:
             skin = min(self.skin.largest, LARGEST_CHANGE * self.skin.skin)
         before = self.skin.skin
         self.set_skin(skin)
-        self.set_extension(self._next_extension(use, before))
+        if use is not None:
+            self.set_extension(self._next_extension(use, before))
         return True
 
     def refresh(self, step: int, *, wrap: bool = True) -> bool:
         """Build the list now (also clears its expiry); True if pair arrays were replaced."""
-        begin = time.perf_counter()
+        begin, allowed = time.perf_counter(), self.list.stretch_allowed
         replaced = self.list.build(wrap=wrap)
         self.seconds += time.perf_counter() - begin
         self.skin.built(step)
+        if self.list.stretch_allowed != allowed:  # segments outgrew the cells
+            self.set_stretch(self.list.stretch_allowed)
         return replaced
 
     def report(self, step: int) -> dict[str, float]:
