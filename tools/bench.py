@@ -5,7 +5,7 @@
     python tools/bench.py accuracy                one flexible fiber: time and error, both methods
     python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
     python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds;
-                                                  with --method auto the shipped scenes as they are
+                                                  these two with --method auto: as shipped
     python tools/bench.py contact [PART ...]      implicit contact: overlaps, A_xx, time over that
                                                   of explicit steps (parts: see bench_contact.py)
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
@@ -265,7 +265,7 @@ def main() -> None:
     benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact"]
     parser.add_argument("bench", choices=benches)
     parser.add_argument("names", nargs="*", help="cells of `suspensions`, parts of `contact`")
-    parser.add_argument("--method", default="bead_chain", help="of `suspensions`")
+    parser.add_argument("--method", default="bead_chain", help="of `period`, `suspensions`")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--strain", type=float, default=60.0)
     parser.add_argument("--segments", type=int, nargs="*", help="0 = full chain")

@@ -172,7 +172,7 @@ class ImplicitContact:
             words[[EXPIRED, HALT]] = 0
             self.state.status.assign(words)
             return True
-        if not self.search.use_up(step):
+        if not self.search.use_up(step, self.check.list_use.numpy()[0]):
             self.step.step_size.assign(0.5 * self.step.step_size.numpy())
         return self.search.refresh(step)
 
