@@ -40,6 +40,7 @@ from tests.reference import unilateral as un
 from tests.reference.bead_chain import Array, shear_gradient
 from tests.reference.overdamped_step import CHI, step_sdirk2
 from tests.row_cell import RowCell
+from warpfiber.passes.contact_rows import KEEP
 from warpfiber.simulation import Simulation
 
 SOLVED = 1e-9
@@ -138,6 +139,7 @@ def test_one_step_of_rods(meeting: Meeting, name: str) -> None:
     rods = rods_at(before.nodes, beads if name == "lengths" else 10.0)
     soft = keys.get("contact", {}).get("stiffness")
     obstacles = un.Obstacles(
+        reach=KEEP,
         lattice=lattice_of(before, keys["box"]),
         walls=walls_of(keys["box"]),
         lubricated=name == "lubrication",
@@ -161,13 +163,13 @@ def test_second_linearization_of_rods(meeting: Meeting) -> None:
     sim = meeting("rigid_rod", 40, flow=AT_ORIGIN, box=WIDE, numerics=TIGHT | {"linearizations": 2})
     before = one_step(sim).at
     rods = rods_at(before.nodes, 10.0)
-    obstacles = un.Obstacles(lattice=before.lattice)
+    obstacles = un.Obstacles(reach=KEEP, lattice=before.lattice)
     first = un.step_rods(rods, GRADIENT, DT, obstacles)
     free = rr.map_rods(rods, GRADIENT, DT)
     center, axis = kicked(free, rods, first.rows, first.force, DT)
     end = snapshot(sim)
     new = rods._replace(center=center, axis=axis)
-    again = cr.rod_rows(new, 0.5, GRADIENT, end.lattice)
+    again = cr.rod_rows(new, KEEP, GRADIENT, end.lattice)
     jacobian = cr.rod_jacobian(new, again)
     gaps = np.array([row.gap for row in again])
     delassus = jacobian @ cr.rod_mobility(rods) @ jacobian.T
@@ -228,7 +230,7 @@ def expected_rows(sim: Simulation, before: Snapshot, free: Array) -> list[Any]:
         put(lattices[1:], wp.mat33d),
         sim.method.step_size,  # type: ignore[attr-defined]
     )
-    found = cell.expected()
+    found = cell.expected(KEEP)
     sim.state.node_pos.assign(now)
     return found
 
@@ -241,7 +243,7 @@ def wall_pushes(free: Array, height: float) -> list[tuple[int, Array, float]]:
             ((0, 0, -1), y[2] - 1.0),
             ((0, 0, 1), height - y[2] - 1.0),
         ):
-            if gap < 0.5:
+            if gap < KEEP:
                 rows.append((node, np.array(normal, float), float(gap)))
     return rows
 
