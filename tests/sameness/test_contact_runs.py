@@ -68,7 +68,7 @@ def test_workers_and_batches(meeting: Meeting, method: str, name: str) -> None:
         sim.step(50)
     for count in (1, 1, 7, 23, 17, 1):
         runs[2].step(count)
-    assert runs[0].method.list is not None and runs[0].method.list.build_count > 3
+    assert runs[0].method.list is not None and runs[0].method.list.build_count > 1
     for other in runs[1:]:
         assert_same(runs[0], other)
     assert np.isfinite(runs[0].node_pos).all()
