@@ -133,27 +133,37 @@ class PairSearch:
         wanted = SPARE * slid * longer * self.skin.skin / before
         return max(0.0, min(wanted, 0.5 * (self._room() - self.skin.skin)))
 
-    def use_up(self, step: int, use: np.ndarray) -> bool:
+    def choose_skin(self, step: int) -> None:
+        """Another skin, the present one being used up."""
+        listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
+        self.set_skin(self.skin.choose(step, listed))
+
+    def use_up(self, step: int, use: np.ndarray | None = None) -> bool:
         """Choose the next skin, the present one being used up; False if none would last a step.
 
-        `use`: what the list was used up by, see `passes.list_bound`.
+        `use`: what the list was used up by, see `passes.list_bound`; without it no segment is
+        listed longer than it is.
         """
-        listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
         short = step <= self.skin.built_step and self.list.build_count > 0
         if short and (self.skin.fixed or self.skin.skin >= self.skin.largest):
             return False
-        skin = self.skin.choose(step, listed)
-        if short:
-            skin = min(self.skin.largest, LARGEST_CHANGE * self.skin.skin)
         before = self.skin.skin
-        self.set_skin(skin)
-        self.set_extension(self._next_extension(use, before))
+        self.choose_skin(step)
+        if short:
+            self.set_skin(min(self.skin.largest, LARGEST_CHANGE * before))
+        if use is not None:
+            self.set_extension(self._next_extension(use, before))
         return True
 
     def refresh(self, step: int, *, wrap: bool = True) -> bool:
         """Build the list now (also clears its expiry); True if pair arrays were replaced."""
-        begin = time.perf_counter()
-        replaced = self.list.build(wrap=wrap)
+        begin, pairs = time.perf_counter(), self.list
+        allowed, skin = pairs.stretch_allowed, pairs.skin
+        replaced = pairs.build(wrap=wrap)
+        if pairs.stretch_allowed > allowed:  # wider cells may leave less room for the skin
+            self.set_stretch(pairs.stretch_allowed)
+            if pairs.skin < skin:
+                replaced |= pairs.build(wrap=False)
         self.seconds += time.perf_counter() - begin
         self.skin.built(step)
         return replaced
