@@ -5,7 +5,7 @@ Units: a = eta = rate = 1, so that the run's units are SI.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ METHODS = {"rigid_rod": RODS, "overdamped": CHAINS}
 
 def meeting_scene(
     method: str,
-    count: int = 30,
+    count: int = 40,
     *,
     kinds: Sequence[Kind] | None = None,
     which: Sequence[int] | None = None,
@@ -48,7 +48,7 @@ class Meeting:
 
     running: list[Simulation]
 
-    def __call__(self, method: str, count: int = 30, **tables: Any) -> Simulation:
+    def __call__(self, method: str, count: int = 40, **tables: Any) -> Simulation:
         workers = tables.pop("workers", 1)
         placement = tables.pop("placement", None)
         scene = meeting_scene(method, count, **tables)
@@ -109,6 +109,3 @@ def rod_nodes(center: Array, axis: Array, half: Array) -> Array:
     lever = half[:, None] * axis
     nodes: Array = np.stack([center - lever, center + lever], axis=1).reshape(-1, 3)
     return nodes
-
-
-Cell = Callable[..., Simulation]

@@ -355,10 +355,12 @@ class Simulation:
         what = f"fiber {torn['fiber']} is torn at node {torn['node']} ({stretch})"
         if torn["stretch"] < TEAR_STRETCH:  # rejected steps have been taken back
             what = f"fiber {torn['fiber']} meets the tolerance with no step that is worth taking"
+        cause = f"; largest term: {torn['largest_term']} ({force:.3g} N)"
+        if torn["contact"] is not None:
+            what, cause, limit = torn["contact"]["message"], "", ""
         torn["message"] = (
             f"diverged at step {self.step_count}, time {self.time:.6g} s, strain "
-            f"{self.strain:.6g}: {what}; largest term: {torn['largest_term']} "
-            f"({force:.3g} N); dt = {self.dt:.4g} s{limit}"
+            f"{self.strain:.6g}: {what}{cause}; dt = {self.dt:.4g} s{limit}"
         )
         return torn
 

@@ -92,7 +92,7 @@ def is_nearest(point: Array, side: Side, t: float, a: float) -> bool:
 def hidden(fraction: float, away: float, along: float, a: float, first: bool) -> bool:
     """In a hollow two places are nearest: of those within one radius, the further from the joint.
 
-    That one is nearer to the point. `away`, `along`: of the other place and this one from the joint.
+    That one is nearer to the point. `away`, `along`: from the joint to the other and this place.
     """
     wins = away >= along if first else away > along
     return fraction > END and away + along < SAME_ARC * a and wins

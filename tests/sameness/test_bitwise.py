@@ -212,8 +212,8 @@ def test_restore_keeps_what_the_box_bears(start: Start) -> None:
     run = begin()
     run.step(1)
     thin, pairs = run.method.skin.least, run.method.list
-    run.method.set_skin(thin)
-    run.method.set_stretch(1.2 * pairs.stretch_allowed)
+    run.method.search.set_skin(thin)
+    run.method.search.set_stretch(1.2 * pairs.stretch_allowed)
     run.method.refresh_list()
     again = begin()
     again.restore(run.snapshot())

@@ -234,3 +234,51 @@ def test_a_list_that_holds_misses_nothing(start: Start, precision: str) -> None:
             )
             assert {(pair.i, pair.j) for pair in near} <= listed
     assert held == [True, True, True, True, True, False]
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_an_extended_list_lets_rods_slide(start: Start, precision: str) -> None:
+    """Sliding up to the extension uses up no skin; beyond it, what is beyond."""
+    rng = np.random.default_rng(3)
+    fibers = [bent_fiber(RODS[0], rng, 20.0 * rng.random(3)) for _ in range(30)]
+    cell = row_cell(start, RODS, fibers, [0] * 30, precision=precision, reach=2.5)
+    cell.pairs.set_skin(0.5)
+    cell.pairs.set_extension(2.0)
+    cell.pairs.build()
+    state, p = cell.sim.state, cell.sim.model.precision
+    check = ContactCheck(
+        cell.sim.model,
+        state,
+        cell.pairs,
+        node_back=cell.node_back,
+        lattice_back=cell.lattice_back,
+        lattice_now=cell.lattice_now,
+    )
+    built = state.list_pos.numpy().astype(float)
+    listed = {(i, j) for i, j, _ in cell.listed()}
+    first = cell.sim.model.host["segment_node"]
+    assert len(first) == 30  # rods of one segment
+    axis = built[first + 1] - built[first]
+    axis /= np.linalg.norm(axis, axis=1)[:, None]
+    affine = np.eye(3)
+    affine[0, 2] = 0.05
+    for slide, held in ((1.9, True), (2.15, True), (2.4, False)):
+        nodes = built.copy()
+        along = slide * np.sign(rng.random(30) - 0.5)[:, None] * axis
+        nodes[first] += along
+        nodes[first + 1] += along
+        moved = wp.array((nodes @ affine.T).astype(p.numpy), dtype=p.vec3)
+        deformation = wp.array(affine[None], dtype=wp.mat33d)
+        executor = Executor(check.list_launches(moved, deformation, np.zeros(3)), "cpu")
+        executor.run(1, never)
+        executor.close()
+        slid, across, limit = check.list_use.numpy()[0]
+        assert slid == pytest.approx(slide, rel=1e-5)
+        assert across < 1e-4
+        assert limit == pytest.approx(0.5 * (0.5 - 3.0 * 0.025), rel=1e-5)
+        # the share beyond the extension, stretched by at most 1.03
+        assert held == (not check.list_short.numpy()[0])
+        near = find_pairs(
+            nodes, cell.sim.fiber_node_start, 2.5, radius=1.0, rest_length=RODS[0].spacing * 2
+        )
+        assert not held or {(pair.i, pair.j) for pair in near} <= listed

@@ -204,7 +204,7 @@ def test_every_near_place_of_two_chains_is_covered(start: Start, seed: int) -> N
                 place[column], place[1 - column] = node, fine[distance.argmin()]
                 apart = np.abs(arcs - 4.0 * place).max(axis=1)
                 assert apart.min() < 2.0
-    # and rows of one place are not repeated, but for one that is nearer: two joints beside each other
+    # and rows of one place are not repeated, but for a nearer one: two joints beside each other
     apart = np.abs(arcs[:, None] - arcs[None]).max(axis=2)
     assert ((apart < 0.1).sum(axis=1) <= 2).all()
     assert ((apart < 0.1).sum(axis=1) > 1).sum() <= 2

@@ -68,7 +68,7 @@ def test_a_long_segment_meets_its_own_image(start: Start) -> None:
     box["size"][0] = 111.0
     sim = cell(start, (LONG, SHORT), fibers + short, which, box=box)
     pairs = sim.method.list
-    sim.method.set_skin(10.0)  # wider than the rule of the box allows: the search itself can
+    sim.method.search.set_skin(10.0)  # wider than the rule of the box allows: the search itself can
     sim.method.refresh_list()
     assert pairs.piece_count > sim.model.segment_count
     assert any(i == j for i, j, _ in check_list(sim))
@@ -82,7 +82,7 @@ def test_every_skin(start: Start) -> None:
     counts = []
     skin = LEAST_SKIN
     while skin <= MOST_SKIN:
-        sim.method.set_skin(2.0 * skin)
+        sim.method.search.set_skin(2.0 * skin)
         sim.method.refresh_list()
         counts.append(len(check_list(sim)))
         skin *= RATIO**4

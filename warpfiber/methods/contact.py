@@ -24,6 +24,7 @@ from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import KEEP, ContactRows
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Scene
 
@@ -127,6 +128,7 @@ class ImplicitContact:
             node_back=step.node_back,
             lattice_back=step.ends_lattice[0:1],
             lattice_now=step.ends_lattice[1:2],
+            fiber_frozen=fiber_frozen,
         )
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)
 
@@ -170,7 +172,7 @@ class ImplicitContact:
             words[[EXPIRED, HALT]] = 0
             self.state.status.assign(words)
             return True
-        if not self.search.use_up(step):
+        if not self.search.use_up(step, self.check.list_use.numpy()[0]):
             self.step.step_size.assign(0.5 * self.step.step_size.numpy())
         return self.search.refresh(step)
 
@@ -212,6 +214,33 @@ class ImplicitContact:
                 met = segment >= 0
                 np.add.at(push, fiber[segment[met]], force[met])
         return push
+
+    def refused(self) -> dict[str, Any] | None:
+        """The pair that made the last step fail and what to do; None if none did."""
+        if int(self.step.verdict.numpy()[0]) != HALVE:
+            return None
+        overlap = float(self.check.largest.numpy()[0])
+        if overlap > FINITE:
+            return None
+        found = self.check.found.numpy()
+        crossed = found[0] > 0
+        segments = found[3:5] if crossed else found[1:3]
+        fiber_of = self.model.host["segment_fiber"]
+        fiber, partner = (int(fiber_of[k]) if k >= 0 else None for k in segments)
+        other = f"fiber {partner}" if partner is not None else "a wall"
+        if partner == fiber:
+            other = "itself"
+        what = (
+            f"would pass through {other}" if crossed else f"overlaps {other} by {overlap:.3g} radii"
+        )
+        remedy = 'give the fibers more room, or let them overlap: numerics.contact = "penalty"'
+        return {
+            "fiber": fiber,
+            "partner": partner,
+            "overlap_radii": overlap,
+            "crossed": bool(crossed),
+            "message": f"no step keeps contacts apart: fiber {fiber} {what}; {remedy}",
+        }
 
     def close(self) -> None:
         """Stop worker threads."""

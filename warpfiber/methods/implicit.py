@@ -246,6 +246,10 @@ class Implicit(Method):
         """Skins, builds and what they looked at; nothing without contact."""
         return self.contact.search.report(self.step_count) if self.contact is not None else {}
 
+    def refused_contact(self) -> dict[str, Any] | None:
+        """Of the last step, if it was its contacts that made it fail."""
+        return self.contact.refused() if self.contact is not None else None
+
     def step_report(self) -> dict[str, float]:
         """Rejected steps and the next dt in s, where they may change; rows of contact."""
         report: dict[str, float] = {}

@@ -1,11 +1,13 @@
 """The search for pairs of a method: its neighbor list, the skin of the list, what builds cost.
 
 The list is built from the present positions; a skin that was used up is chosen anew, and grows
-where it did not last a single step.
+where it did not last a single step. Segments are listed as long as they slid along themselves in
+the time of the list before.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 
@@ -16,6 +18,11 @@ from warpfiber.methods.skin import LARGEST_CHANGE, LEAST_SKIN, MOST_SKIN, START_
 from warpfiber.model import PAIR_COUNT, Model, State
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
+
+# as PAIR_COST: the rows and the check of an implicit step look at every listed pair
+STEP_PAIR_COST = 16.0
+MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
+SPARE = 1.1
 
 
 class PairSearch:
@@ -51,6 +58,7 @@ class PairSearch:
             workers=workers,
             native=native,
         )
+        self.lasting = lasting_height(scene) / model.units.length
         self.skin = self._skin_choice(skin)
         self.strain_end = self.bearable_strain()
 
@@ -69,15 +77,19 @@ class PairSearch:
             core=2.0 * min(row["radius"] for row in rows),
             length=float(np.average([row["rest"] for row in rows], weights=segments)),
             pieces_per_segment=pairs.piece_count / self.model.segment_count,
+            pair_cost=STEP_PAIR_COST,
             fixed=self.scene.numerics.skin is not None,
         )
 
     def _largest_skin(self, start: float) -> float:
         """What a lasting box has room for; a box that is flattened keeps the start skin."""
-        room = lasting_height(self.scene) / self.model.units.length
-        room -= self.list.cell_width - self.list.skin
-        most: float = min(2.0 * MOST_SKIN * self.radius, room * (1.0 - 1e-9))
+        most: float = min(2.0 * MOST_SKIN * self.radius, self._room() * (1.0 - 1e-9))
         return max(start, most)
+
+    def _room(self) -> float:
+        """Height of the box beyond what a list without skin and extension takes."""
+        pairs = self.list
+        return self.lasting - (pairs.cell_width - pairs.skin - 2.0 * pairs.extension)
 
     def bearable_strain(self) -> float:
         """Strain that the box can bear; raises SceneError if it is too small from the start."""
@@ -87,9 +99,11 @@ class PairSearch:
     def box_width(self) -> float:
         """Smallest height that a periodic box may have.
 
-        With the start skin: a run and its continuation have chosen others when they ask.
+        With the start skin and no extension: a run and its continuation have chosen others when
+        they ask.
         """
-        return self.list.cell_width - self.list.skin + self.skin.start
+        pairs = self.list
+        return pairs.cell_width - pairs.skin - 2.0 * pairs.extension + self.skin.start
 
     def set_skin(self, skin: float) -> None:
         """Another skin, from the next list on."""
@@ -104,22 +118,52 @@ class PairSearch:
         self.set_skin(min(self.skin.skin, self.skin.largest))
         self.strain_end = self.bearable_strain()
 
-    def use_up(self, step: int) -> bool:
-        """Choose the next skin, the present one being used up; False if none would last a step."""
+    def set_extension(self, extension: float) -> None:
+        """Another extension of listed segments, from the next list on."""
+        self.skin.length += 2.0 * (extension - self.list.extension)
+        if extension != self.list.extension:
+            self.list.set_extension(extension)
+
+    def _next_extension(self, use: np.ndarray, before: float) -> float:
+        """What segments will slide while the next skin lasts; `before` the skin used up."""
+        slid, across, limit = (float(value) for value in use)
+        if self.skin.fixed or not math.isfinite(slid + across):
+            return 0.0
+        longer = min(MOST_LONGER, limit / across) if 0.0 < across < limit else 1.0
+        wanted = SPARE * slid * longer * self.skin.skin / before
+        return max(0.0, min(wanted, 0.5 * (self._room() - self.skin.skin)))
+
+    def choose_skin(self, step: int) -> None:
+        """Another skin, the present one being used up."""
         listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
+        self.set_skin(self.skin.choose(step, listed))
+
+    def use_up(self, step: int, use: np.ndarray | None = None) -> bool:
+        """Choose the next skin, the present one being used up; False if none would last a step.
+
+        `use`: what the list was used up by, see `passes.list_bound`; without it no segment is
+        listed longer than it is.
+        """
         short = step <= self.skin.built_step and self.list.build_count > 0
         if short and (self.skin.fixed or self.skin.skin >= self.skin.largest):
             return False
-        skin = self.skin.choose(step, listed)
+        before = self.skin.skin
+        self.choose_skin(step)
         if short:
-            skin = min(self.skin.largest, LARGEST_CHANGE * self.skin.skin)
-        self.set_skin(skin)
+            self.set_skin(min(self.skin.largest, LARGEST_CHANGE * before))
+        if use is not None:
+            self.set_extension(self._next_extension(use, before))
         return True
 
     def refresh(self, step: int, *, wrap: bool = True) -> bool:
         """Build the list now (also clears its expiry); True if pair arrays were replaced."""
-        begin = time.perf_counter()
-        replaced = self.list.build(wrap=wrap)
+        begin, pairs = time.perf_counter(), self.list
+        allowed, skin = pairs.stretch_allowed, pairs.skin
+        replaced = pairs.build(wrap=wrap)
+        if pairs.stretch_allowed > allowed:  # wider cells may leave less room for the skin
+            self.set_stretch(pairs.stretch_allowed)
+            if pairs.skin < skin:
+                replaced |= pairs.build(wrap=False)
         self.seconds += time.perf_counter() - begin
         self.skin.built(step)
         return replaced
@@ -131,6 +175,7 @@ class PairSearch:
         report: dict[str, float] = {
             "skin_diameters": round(choice.skin / diameter, 4),
             "skin_mean_diameters": round(choice.mean(step) / diameter, 4),
+            "extension_diameters": round(pairs.extension / diameter, 4),
             "builds": pairs.build_count,
             "growths": pairs.grow_count,
             "steps_per_build": round(choice.steps_counted(step) / max(1, pairs.build_count), 2),
@@ -148,13 +193,15 @@ class PairSearch:
     def saved(self) -> dict[str, np.ndarray]:
         """What the next list depends on."""
         allowed = np.asarray(self.list.stretch_allowed)
-        return {"stretch_allowed": allowed, "skin": self.skin.saved()}
+        extension = np.asarray(self.list.extension)
+        return {"stretch_allowed": allowed, "extension": extension, "skin": self.skin.saved()}
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> bool:
         """Build again the list that the saved run had, which was built from older positions."""
         state = self.state
         self.set_stretch(float(arrays["stretch_allowed"]))
         self.set_skin(float(arrays["skin"][0]))
+        self.set_extension(float(arrays["extension"]))
         self.skin.begun = step
         state.node_pos.assign(arrays["list_pos"])
         state.lattice.assign(arrays["list_lattice"])

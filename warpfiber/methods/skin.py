@@ -1,6 +1,6 @@
 """How thick the skin of a neighbor list should be: what builds cost against what it adds to sweeps.
 
-A step costs build(s) u / s + PAIR_COST pairs(s) at the skin s, if motion uses up u of it per step.
+A step costs build(s) u / s + pair_cost pairs(s) at the skin s, if motion uses up u of it per step.
 Builds tell u and the number of pairs; how the number changes with s follows from the volume around
 a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
 (excluded volume of spherocylinders, Onsager 1949). One list, not two: by their measured parts (ns
@@ -22,7 +22,7 @@ import numpy as np
 
 # ns, one core, float64, 20,000 segments; only ratios matter.
 BUILD_PIECE, BUILD_NEAR = 110.0, 95.0  # of a piece; of what it finds around it at the first skin
-PAIR_COST = 11.0  # of one more listed pair in a step, gathered too
+PAIR_COST = 11.0  # of one more listed pair in an explicit step, gathered too
 START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
@@ -45,6 +45,7 @@ class SkinChoice:
     core: float  # distance of center lines in contact
     length: float  # mean length of a segment
     pieces_per_segment: float
+    pair_cost: float = PAIR_COST
     fixed: bool = False
     use: float = 0.0  # skin per step; 0 as long as nothing is known
     built_step: int = 0
@@ -92,7 +93,7 @@ class SkinChoice:
         pairs = pairs_per_segment * (self.volume(self.reach + skin) - core) / now
         near = self._around(skin) / self._around(2.0 * START_SKIN * self.radius)
         build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * near)
-        return build / max(1.0, skin / self.use) + PAIR_COST * pairs
+        return build / max(1.0, skin / self.use) + self.pair_cost * pairs
 
     def _around(self, skin: float) -> float:
         """Volume around a segment in which midpoints are compared."""

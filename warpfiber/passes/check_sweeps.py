@@ -36,6 +36,7 @@ class CheckFeatures:
 
     periodic: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
+    frozen: bool = False  # some fibers are; nothing moves two of them, or one from a wall
 
 
 @cache
@@ -180,6 +181,7 @@ def make_check_sweeps(name: str, features: CheckFeatures):
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
+        fiber_frozen: wp.array(dtype=wp.uint8),
         out_start: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -227,7 +229,11 @@ def make_check_sweeps(name: str, features: CheckFeatures):
             # lines that met are no further apart than they moved: the most that a corner did
             moved2 = wp.max(wp.length_sq(w), wp.length_sq(w - wa))
             moved2 = wp.max(moved2, wp.max(wp.length_sq(w + wb), wp.length_sq(w + wb - wa)))
-            if dd <= moved2 or dd < real(4.0) * widest * widest:
+            looked_at = wp.bool(True)
+            if wp.static(features.frozen):
+                both = fiber_frozen[segment_fiber[i]] & fiber_frozen[segment_fiber[j]]
+                looked_at = both == wp.uint8(0)
+            if looked_at and (dd <= moved2 or dd < real(4.0) * widest * widest):
                 gi = groups[fiber_group[segment_fiber[i]]]
                 gj = groups[fiber_group[segment_fiber[j]]]
                 contact = gi.radius + gj.radius
@@ -253,6 +259,9 @@ def make_check_sweeps(name: str, features: CheckFeatures):
             first = wp.int32(1)
             if node_i == fiber_node_start[fiber]:
                 first = 0
+            if wp.static(features.frozen):
+                if fiber_frozen[fiber] != wp.uint8(0):
+                    first = 2
             for node in range(node_i + first, node_i + 2):
                 for axis in range(3):
                     if has_wall(axis):

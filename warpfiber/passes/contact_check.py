@@ -27,7 +27,7 @@ class ContactCheck:
     position is not finite. `found` (5) int32: how many pairs passed through each other and nodes
     through walls; segment and partner of the largest overlap; segment and partner of a crossing
     (-1: none, as a partner a wall). `list_short` (1) int32: 1 if the list may miss a pair that
-    is within its reach where the step would end.
+    is within its reach where the step would end; `list_use` (1) vec3: see `list_bound`.
     """
 
     def __init__(
@@ -39,14 +39,16 @@ class ContactCheck:
         node_back: Any,
         lattice_back: Any,
         lattice_now: Any,
+        fiber_frozen: Any = None,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
         self.node_back = node_back
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         domain, name = model.domain, model.precision.name
-        self.kernels = dict(
-            make_check_sweeps(name, CheckFeatures(any(domain.periodic), domain.wall))
-        )
+        none = wp.zeros(0, dtype=wp.uint8, device=model.device)
+        self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
+        features = CheckFeatures(any(domain.periodic), domain.wall, fiber_frozen is not None)
+        self.kernels = dict(make_check_sweeps(name, features))
         self.kernels |= make_list_bound(name)
         segments = model.segment_count
         self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
@@ -59,6 +61,9 @@ class ContactCheck:
         self.found = self._int(5)
         self.fiber_short = self._int(model.fiber_count)
         self.list_short = self._int(1)
+        vec3, device = model.precision.vec3, model.device
+        self.fiber_use = wp.zeros(model.fiber_count, dtype=vec3, device=device)
+        self.list_use = wp.zeros(1, dtype=vec3, device=device)
 
     def _int(self, size: int) -> Any:
         return wp.zeros(size, dtype=wp.int32, device=self.model.device)
@@ -78,6 +83,7 @@ class ContactCheck:
             model.fiber_group,
             model.segment_node,
             model.segment_fiber,
+            self.fiber_frozen,
             pairs.out_start,
             pairs.pair_j,
             pairs.pair_image,
@@ -118,10 +124,12 @@ class ContactCheck:
             node_pos,
             state.status,
             self.fiber_short,
+            self.fiber_use,
         ]
+        reduced = [self.fiber_short, self.fiber_use, state.status, self.list_short, self.list_use]
         return [
             self._launch("bound_fibers", model.fiber_count, bound, split=True),
-            self._launch("bound_list", 1, [self.fiber_short, state.status, self.list_short]),
+            self._launch("bound_list", 1, reduced),
         ]
 
     def _launch(self, name: str, dim: int, inputs: list[Any], split: bool = False) -> Launch:

@@ -118,9 +118,31 @@ def flat(items: Iterable[Launch | Call | Repeat]) -> list[Launch | Call]:
     return [launch for launch in found if launch.dim > 0]
 
 
-def median(values: Sequence[float]) -> float:
-    """The middle value, 0 of none."""
-    return float(sorted(values)[len(values) // 2]) if values else 0.0
+@dataclass
+class StepTimes:
+    """Seconds of an empty graph, and of each launch of one step with how often it ran."""
+
+    idle: float
+    seconds: dict[str, float]
+    replays: dict[str, int]
+
+
+def median_times(steps: Sequence[StepTimes]) -> dict[str, float]:
+    """Median seconds of every launch of the steps.
+
+    The cost of replaying an empty graph is subtracted: it is not paid inside a whole step.
+    """
+
+    def median(values: list[float]) -> float:
+        return sorted(values)[len(values) // 2]
+
+    if not steps:
+        return {}
+    idle = median([step.idle for step in steps])
+    return {
+        name: max(0.0, median([step.seconds[name] - idle * step.replays[name] for step in steps]))
+        for name in steps[0].seconds
+    }
 
 
 class Executor:
@@ -138,6 +160,7 @@ class Executor:
         work = sum(launch.dim for launch in self.launches)
         self.batches = work < BATCH_BELOW or not device.startswith("cpu")
         self._pool: Workers | None = None
+        self._apart: list[tuple[list[Any], Launch | Call | Repeat]] = []
         if self.workers > 1:
             phases = self._capture_phases(self.items)
             load_kernels([wait_kernel()], device)
@@ -197,32 +220,21 @@ class Executor:
             wp.capture_launch(self._batch)
             steps -= batch
 
-    def time_launches(self, steps: int, halted: Callable[[], bool]) -> dict[str, float]:
-        """Seconds per step of every launch, over up to `steps` real steps by one worker.
-
-        The cost of replaying an empty graph is subtracted: it is not paid inside a whole step.
-        """
-        idle = self._capture_apart([])
-        items = [(self._capture_apart(flat([item])), item) for item in self.items]
-        seconds: dict[str, list[float]] = {launch.name: [] for launch in self.launches}
-        rests: list[float] = []
-        replays: dict[str, list[int]] = {name: [] for name in seconds}
-        for _ in range(steps):
-            if halted():
-                break
-            rests += self._time(idle)
-            for graphs, item in items:
-                rounds = [self._time(graphs)] if isinstance(item, Launch | Call) else []
-                while isinstance(item, Repeat) and item.going.numpy()[0] != 0:
-                    rounds.append(self._time(graphs))
-                for k, launch in enumerate(flat([item])):
-                    seconds[launch.name].append(sum(times[k] for times in rounds))
-                    replays[launch.name].append(len(rounds))
-        rest = median(rests)
-        return {
-            name: max(0.0, median(times) - rest * median(replays[name]))
-            for name, times in seconds.items()
-        }
+    def time_step(self) -> StepTimes:
+        """Seconds of every launch over one real step by one worker."""
+        if not self._apart:
+            self._idle = self._capture_apart([])
+            self._apart = [(self._capture_apart(flat([item])), item) for item in self.items]
+        times = StepTimes(self._time(self._idle)[0], {}, {})
+        for graphs, item in self._apart:
+            rounds = [self._time(graphs)] if isinstance(item, Launch | Call) else []
+            while isinstance(item, Repeat) and item.going.numpy()[0] != 0:
+                rounds.append(self._time(graphs))
+            for k, launch in enumerate(flat([item])):
+                before = times.seconds.get(launch.name, 0.0), times.replays.get(launch.name, 0)
+                times.seconds[launch.name] = before[0] + sum(found[k] for found in rounds)
+                times.replays[launch.name] = before[1] + len(rounds)
+        return times
 
     def _capture_apart(self, launches: Sequence[Launch | Call]) -> list[Any]:
         """A graph of each launch; an empty one if there are none."""

@@ -1,9 +1,13 @@
 """Whether a neighbor list still holds every pair within its reach, at positions not yet taken.
 
-Source: motion u = x - x_o - F (x_build - x_o) beside the flow since the build; no unlisted pair is
-    within reach while 2 max|u| + (1 - sigma_min(F)) h_list <= skin.
+Source: a segment as listed, carried by the flow since the build: the line from x_o + F (x - x_o) of
+    one listed node to that of the other, longer by the extension of the list at both ends. If no
+    node is farther than u from the line of each of its segments, no unlisted pair is within reach
+    while 2 u + (1 - sigma_min(F)) h_list <= skin. What slides along itself, as rigid fibers do in a
+    flow that would stretch them, uses up the extension first.
 Symbols: F deformation since the build, sigma_min its smallest singular value, h_list reach + skin,
-    x_o origin of the flow.
+    x_o origin of the flow; `use` of a list: farthest sliding and distance from the lines without
+    end, and the largest u allowed.
 """
 
 from functools import cache
@@ -18,7 +22,7 @@ def make_list_bound(name: str):
     """`bound_fibers` and `bound_list` in launch order, as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
-    zero, half = real(0.0), real(0.5)
+    zero, half, one = real(0.0), real(0.5), real(1.0)
     options = {"module": "unique", "enable_backward": False, "grid_stride": False}
 
     @wp.func
@@ -46,6 +50,7 @@ def make_list_bound(name: str):
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
         short_out: wp.array(dtype=wp.int32),
+        use_out: wp.array(dtype=vec3),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -53,25 +58,44 @@ def make_list_bound(name: str):
         affine = mat33(deformation[0])
         limit = farthest_motion(affine, list_sizes)
         found = wp.int32(0)
-        for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
-            moved = node_pos[i] - flow_origin - affine * (list_pos[i] - flow_origin)
-            if not (wp.length_sq(moved) <= limit * limit):
-                found = 1
+        slid = zero
+        across = zero
+        for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
+            listed = list_pos[i + 1] - list_pos[i]
+            length = wp.length(listed)
+            beyond = list_sizes[2] / length
+            start = flow_origin + affine * (list_pos[i] - flow_origin)
+            axis = affine * listed
+            inverse = one / wp.dot(axis, axis)
+            for end in range(2):
+                apart = node_pos[i + end] - start
+                s = wp.dot(apart, axis) * inverse
+                nearest = wp.clamp(s, -beyond, one + beyond)
+                if not (wp.length_sq(apart - nearest * axis) <= limit * limit):
+                    found = 1
+                slid = wp.max(slid, wp.max(-s, s - one) * length)
+                across = wp.max(across, wp.length_sq(apart - s * axis))
         if limit < zero:
             found = 1
         short_out[fiber] = found
+        use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
 
     @wp.kernel(**options)
     def bound_list(
         fiber_short: wp.array(dtype=wp.int32),
+        fiber_use: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
         list_short_out: wp.array(dtype=wp.int32),
+        list_use_out: wp.array(dtype=vec3),
     ):
         if status[wp.static(HALT)] != 0:
             return
         found = wp.int32(0)
+        use = vec3()
         for fiber in range(fiber_short.shape[0]):
             found = wp.max(found, fiber_short[fiber])
+            use = wp.max(use, fiber_use[fiber])
         list_short_out[0] = found
+        list_use_out[0] = use
 
     return {"bound_fibers": bound_fibers, "bound_list": bound_list}

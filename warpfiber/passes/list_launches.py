@@ -72,6 +72,7 @@ def _bin(pairs: NeighborList) -> Launches:
             "bin_pieces",
             pairs.piece_count,
             wp.vec3d(*model.domain.low),
+            pairs.sizes,
             pairs.inverse,
             pairs.cells,
             pairs.piece_segment,

@@ -57,8 +57,10 @@ class NeighborList:
     """Half list of segment pairs nearer than `reach` + `skin` (run units).
 
     Arrays: `out_start` (S+1), `pair_i`, `pair_j`, `pair_image` (capacity), sorted by (i, j); pairs
-    where j = s are `in_pair[in_start[s]:in_start[s+1]]`. `sizes` (reach + skin, longest piece) and
-    `skin_out` (reach + skin, skin) are read by kernels, so the skin may change between builds.
+    where j = s are `in_pair[in_start[s]:in_start[s+1]]`. `sizes` (reach + skin, longest piece,
+    extension) and `skin_out` (reach + skin, skin, extension) are read by kernels, so these may
+    change between builds. Segments are listed as if longer by the extension at each end: what
+    slides along itself uses up that before the skin.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class NeighborList:
     ) -> None:
         self.model, self.state = model, state
         self.reach, self.skin = reach, skin
+        self.extension = 0.0
         self.longest_rest = longest_rest
         self.stretch_allowed = max(FIRST_STRETCH, START_ROOM * stretch)
         self.row_capacity = row_capacity
@@ -116,6 +119,7 @@ class NeighborList:
             volume = float(numbers @ sizes) / OPEN_FRACTION
         counts = piece_counts(rest, numbers.tolist(), self.reach + self.skin, volume)
         self.longest_piece = max(r / c for r, c in zip(rest, counts, strict=True))
+        self.fewest_pieces = min(counts)
         each = np.asarray(counts)[mine]
         self.piece_count = int(each.sum())
         # segments of one fiber nearer than pi a along it are never a pair
@@ -137,7 +141,8 @@ class NeighborList:
     @property
     def cell_width(self) -> float:
         """Width that holds a segment, its reach and the skin."""
-        return self.stretch_allowed * self.longest_rest + self.reach + self.skin
+        longest = self.stretch_allowed * self.longest_rest + 2.0 * self.extension
+        return longest + self.reach + self.skin
 
     def set_stretch(self, stretch: float) -> None:
         """Cells that hold segments of this many rest lengths, from the next build on."""
@@ -149,10 +154,17 @@ class NeighborList:
         self.skin = skin
         self._write_sizes()
 
+    def set_extension(self, extension: float) -> None:
+        """Segments that are listed as longer by this at each end, from the next build on."""
+        self.extension = extension
+        self._write_sizes()
+
     def _write_sizes(self) -> None:
-        extent = self.reach + self.skin
-        self.sizes.assign(np.asarray([extent, self.stretch_allowed * self.longest_piece]))
-        self.skin_out.assign(np.asarray([extent, self.skin], dtype=self.model.precision.numpy))
+        extent, extension = self.reach + self.skin, self.extension
+        longest = self.stretch_allowed * self.longest_piece + 2.0 * extension / self.fewest_pieces
+        self.sizes.assign(np.asarray([extent, longest, extension]))
+        told = np.asarray([extent, self.skin, extension])
+        self.skin_out.assign(told.astype(self.model.precision.numpy))
 
     # -- arrays -----------------------------------------------------------------------------------
 
@@ -164,8 +176,8 @@ class NeighborList:
         segments, count = self.model.segment_count, self.piece_count
         self.stride = count + PLANE_PADDING
         self.cell_capacity = MAX_CELLS_PER_PIECE * count + 64
-        self.sizes = wp.zeros(2, dtype=wp.float64, device=device)
-        self.skin_out = wp.zeros(2, dtype=p.real, device=device)
+        self.sizes = wp.zeros(3, dtype=wp.float64, device=device)
+        self.skin_out = wp.zeros(3, dtype=p.real, device=device)
         self._write_sizes()
         self.wraps = self._int(1)
         self._wraps = 0

@@ -5,8 +5,9 @@ the nearest point of segment j, 3 and 4 those of j against i. The ends of an ove
 parallel fibers block the turning about a single point.
 
 Source: closed forms on lines. A row within one radius of a row already kept, along both fibers, is
-    left out, unless it is nearer. In a chain a joint belongs to the segment that ends there, so that it gives one row
-    per place of the other fiber that is nearest to it, whatever number of segments meet.
+    left out, unless it is nearer. In a chain a joint belongs to the segment that ends there, so
+    that it gives one row per place of the other fiber that is nearest to it, whatever number of
+    segments meet.
 Symbols: D = `delta` from the start of a to the start of b, s and t fractions of a and b; relative
     motion over the step w(s, t) = w_0 + t w_b - s w_a; gap g = |c| - a_i - a_j, c = D + t b - s a.
 Limits: center lines that cross exactly have the normal a x b, whatever side they came from.
