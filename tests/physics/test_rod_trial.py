@@ -23,6 +23,7 @@ def cell(modulus: float, **keys: Any) -> wf.Scene:
         "box.boundary": ["periodic"] * 3,
         "contact.lubrication": "none",
         "numerics.method": "auto",
+        "numerics.tolerance": 1e-3,
         "fibers.0.youngs_modulus": modulus,
     }
     return wf.load_scene(SCENE, tables | keys)
