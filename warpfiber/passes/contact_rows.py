@@ -22,7 +22,7 @@ from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
 
-KEEP = 0.2  # radii of the thinner fiber: rows with a smaller predicted gap are kept
+KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 GROWTH = 1.3
 
 
