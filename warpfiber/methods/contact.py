@@ -22,7 +22,6 @@ from warpfiber.methods.pair_search import PairSearch
 from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import ContactRows
-from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
@@ -144,7 +143,7 @@ class ImplicitContact:
 
     def launches(self) -> Launches:
         """From the motion without contact to the verdict on the step."""
-        state, step, verdict = self.state, self.step, make_contact_verdict()
+        state, step, verdict = self.state, self.step, self.check.kernels
         found: Launches = [
             *self.check.list_launches(state.node_pos, step.deformation_next, self.flow_origin)
         ]
