@@ -92,9 +92,9 @@ def test_choice(keys: dict[str, object], method: str, reason: str) -> None:
 
 
 def test_contact_asks_for_more_stiffness() -> None:
-    """Where fibers meet, what bends them is contact: S_eff of 1 is not enough, 100 is."""
+    """Where fibers meet, what bends them is contact: S_eff of 1 is not enough, 1000 is."""
     soft = read(ROD, contact__law="exponential")
-    stiff = read(ROD, contact__law="exponential", fibers__0__youngs_modulus=2e15)
+    stiff = read(ROD, contact__law="exponential", fibers__0__youngs_modulus=2e16)
     assert soft.numerics.method == "overdamped"
     assert "bending of fibers.0 by contact" in (soft.method_reason or "")
     assert stiff.numerics.method == "rigid_rod"

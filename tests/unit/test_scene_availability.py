@@ -80,7 +80,7 @@ OVERDAMPED: dict[str, object] = {
     "numerics.method": "overdamped",
     "contact.law": "none",
     "contact.lubrication": GONE,
-    "box.boundary": ["periodic", "open", "periodic"],
+    "box.boundary": ["periodic", "periodic", "periodic"],
     "fibers.0.density": GONE,
 }
 

@@ -172,6 +172,11 @@ TOGETHER: list[tuple[dict[str, object], str, str]] = [
         "box.boundary",
         "along the periodic axis z",
     ),
+    (
+        {"box.boundary": ["periodic", "open", "periodic"]},
+        "box.boundary",
+        "along the periodic axis z of a box with open axes",
+    ),
     ({"fibers.0.count": 8000}, "fibers.0.count", "fill 1.01 of the box"),
     (
         {"fibers.0.count": GONE, "fibers.0.volume_fraction": 0.95},

@@ -162,16 +162,22 @@ def _check_flow(draft: Draft) -> None:
 
 
 def _check_flow_in_box(draft: Draft) -> None:
-    """With walls, a linear flow does not change along a periodic axis: images would differ."""
+    """The lattice moves with the flow if all axes are periodic; else images would differ.
+
+    Without pairs, images beside open axes do not matter.
+    """
     flow = draft.flow_object
     gradient = flow.velocity_gradient if flow is not None else None
-    if flow is None or gradient is None or not draft.axes("wall"):
+    meets = draft.axes("open") and draft.contact["law"] != "none"
+    if flow is None or gradient is None or not (draft.axes("wall") or meets):
         return
+    others = "walls" if draft.axes("wall") else "open axes"
     for axis, _ in draft.axes("periodic"):
         if any(row[axis] != 0.0 for row in gradient):
-            remedy = f"{flow.kind} changes along the periodic axis {AXES[axis]} of a box with walls"
+            remedy = f"{flow.kind} changes along the periodic axis {AXES[axis]} of a box with "
+            remedy += f"{others}; make that axis a wall or open, or all axes periodic"
             key = "box.boundary" if draft.is_given("box.boundary") else "flow.kind"
-            draft.blame(key, f"{remedy}; make that axis a wall, or all axes periodic")
+            draft.blame(key, remedy)
 
 
 def _check_periodic_edges(draft: Draft) -> None:
