@@ -38,6 +38,7 @@ def meeting_scene(
     """Scene of `count` fibers at random in a sheared cell; numerics and tables as given."""
     kinds = METHODS[method] if kinds is None else kinds
     numerics = {"method": method, "dt": 0.05, **tables.pop("numerics", {})}
+    numerics = {key: value for key, value in numerics.items() if value is not None}
     tables = {"box": BOX, "flow": SHEAR, "contact": HARD, **tables}
     return cell_scene(kinds, [0] * count if which is None else which, numerics=numerics, **tables)
 

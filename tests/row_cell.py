@@ -17,6 +17,7 @@ from warpfiber.passes.neighbors import NeighborList
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
+NEAR = 0.5  # radii: rows with a smaller predicted gap are looked at
 
 
 def never() -> bool:
@@ -50,7 +51,7 @@ class RowCell:
             lattice_back=self.lattice_back,
             lattice_now=self.lattice_now,
             step_size=self.step_size,
-            **keys,
+            **({"keep": NEAR} | keys),
         )
 
     def made(self, workers: int = 1, **keys: Any) -> ContactRows:
@@ -101,7 +102,7 @@ class RowCell:
         )
         return side, moved[node : node + 2]
 
-    def expected(self, keep: float = 0.5) -> list[tuple[int, int, tuple[int, ...], PairRow]]:
+    def expected(self, keep: float = NEAR) -> list[tuple[int, int, tuple[int, ...], PairRow]]:
         """Rows of pairs by the restatement, in the order of the list."""
         found = []
         fiber = self.sim.model.host["segment_fiber"]

@@ -23,17 +23,18 @@ def cell(modulus: float, **keys: Any) -> wf.Scene:
         "box.boundary": ["periodic"] * 3,
         "contact.lubrication": "none",
         "numerics.method": "auto",
+        "numerics.tolerance": 1e-3,
         "fibers.0.youngs_modulus": modulus,
     }
     return wf.load_scene(SCENE, tables | keys)
 
 
-@pytest.mark.parametrize(("stiffer", "tried"), [(1.0, False), (10.0, True), (100.0, False)])
+@pytest.mark.parametrize(("stiffer", "tried"), [(1.0, False), (10.0, True), (1000.0, False)])
 def test_only_an_open_question_is_tried(stiffer: float, tried: bool) -> None:
-    """A bound within the tolerance needs no trial, one far above it has no chance."""
+    """A bound far below the tolerance needs no trial, one far above it has no chance."""
     scene = cell(stiffer * STIFF)
     assert (scene.rod_trial is not None) == tried
-    assert scene.numerics.method == ("rigid_rod" if stiffer == 100.0 else "overdamped")
+    assert scene.numerics.method == ("rigid_rod" if stiffer == 1000.0 else "overdamped")
     assert after_trial(scene).rod_trial is None
 
 

@@ -112,6 +112,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
         *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
         *("rod_maps rod_step".split()),
+        *("bond_sweep bond_drift carry_memory capsule_pairs measure_bonds".split()),
         *listed,
         *contact,
     }

@@ -16,7 +16,7 @@ import pytest
 from tests.cell import Kind, straight_fiber
 from tests.placed import segment_distance
 from tests.reference.contact_rows import Line, line_rows
-from tests.row_cell import RowCell, dropped, host_rows, row_cell, run, shaken
+from tests.row_cell import NEAR, RowCell, dropped, host_rows, row_cell, run, shaken
 from warpfiber.model import HALT
 from warpfiber.simulation import Simulation
 
@@ -26,7 +26,7 @@ SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
 BOX = {"size": [26.0, 22.0, 24.0]}
 
 
-def check_pairs(cell: RowCell, keep: float = 0.5, least: int = 20) -> None:
+def check_pairs(cell: RowCell, keep: float = NEAR, least: int = 20) -> None:
     """Rows of pairs are those of the restatement."""
     tolerance = TOLERANCE[cell.sim.model.precision.name]
     rows = cell.made(keep=keep)
@@ -291,7 +291,7 @@ def test_growing_keeps_the_forces(start: Start) -> None:
     run(small)
     assert int(small.row_need.numpy()[0]) > count
     assert small.grow()
-    small.keep = 0.5
+    small.keep = NEAR
     run(small)
     assert (host_rows(small)["force"] == force).all()
 

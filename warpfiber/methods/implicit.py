@@ -6,6 +6,7 @@ end (time, flow; acceptance and the size of the next step where it may be reject
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -18,6 +19,7 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.executor import Call, Launch, Repeat, flat, load_kernels
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.passes.step_control import (
     ERROR_CHUNKS,
@@ -60,6 +62,13 @@ class Implicit(Method):
         first = step_start(scene) / model.units.time if self.adaptive else self.dt
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
         self.contact: ImplicitContact | None = None
+        # what the step consists of: one module for all kernels that are not of the fibers alone
+        sheared, method = model.domain.sheared, scene.numerics.method
+        self.module = kernel_module("step", p.name, method, sheared, self.adaptive, self.meets)
+
+    def _worker_break_even(self) -> float:
+        """With contact none: every update of its forces hands over three times between workers."""
+        return math.inf if has_contact(self.scene) else super()._worker_break_even()
 
     def _make_contact(self, response: MovingResponse) -> None:
         """Contact, once the arrays of the method exist."""
@@ -114,7 +123,7 @@ class Implicit(Method):
         if self.adaptive:
             chunks = self.error.shape[0]
             errors = [chunks, self.fiber_error, self.error, self.error_fiber]
-            steps.append(Launch("errors", make_largest_error(name), chunks, errors))
+            steps.append(Launch("errors", make_largest_error(name, self.module), chunks, errors))
         steps.append(self._end())
         if self.keeps:
             steps.append(self._take_back())
@@ -137,14 +146,16 @@ class Implicit(Method):
             self.ends_lattice,
             self.deformation_next,
         ]
-        begin = make_step_begin(self.model.precision.name, self.model.domain.sheared)
+        name = self.model.precision.name
+        begin = make_step_begin(name, self.model.domain.sheared, self.module)
         return Launch("begin", begin, 1, inputs)
 
     def _end(self) -> Launch:
         model, state = self.model, self.state
         tolerance = self.scene.numerics.tolerance or 0.0
         judged = self.contact is not None
-        kernel = make_step_end(model.precision.name, model.domain.sheared, self.adaptive, judged)
+        name, sheared = model.precision.name, model.domain.sheared
+        kernel = make_step_end(name, sheared, self.adaptive, judged, self.module)
         inputs = [
             wp.mat33d(*self.full_gradient.ravel()),
             self._schedule(),
@@ -180,7 +191,7 @@ class Implicit(Method):
             state.node_velocity,
             tensions[0],
         ]
-        kernel = make_take_back(model.precision.name, tensions[0].shape[0] > 0)
+        kernel = make_take_back(model.precision.name, tensions[0].shape[0] > 0, self.module)
         return Launch("take_back", kernel, model.fiber_count, inputs, split=True)
 
     def tensions(self) -> tuple[Any, Any]:

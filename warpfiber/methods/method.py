@@ -72,12 +72,16 @@ class Method(ABC):
     def launches(self) -> list[Launch | Call | Repeat]:
         """The launches of one step."""
 
+    def _worker_break_even(self) -> float:
+        """Segments from which a second worker pays."""
+        return WORKER_BREAK_EVEN
+
     def _choose_workers(self, workers: int | None) -> int:
         if not self.model.device.startswith("cpu"):
             return 1
         if workers is not None:
             return workers
-        if self.model.segment_count < WORKER_BREAK_EVEN:
+        if self.model.segment_count < self._worker_break_even():
             return 1
         try:
             cores = len(os.sched_getaffinity(0))

@@ -60,7 +60,7 @@ class RigidRod(Implicit):
             self.state.status,
             self.maps,
         ]
-        maps = make_rod_maps(self.model.precision.name)
+        maps = make_rod_maps(self.model.precision.name, self.module)
         return Launch("maps", maps, self.maps.shape[0], inputs)
 
     def _move(self) -> Launch:
@@ -78,7 +78,8 @@ class RigidRod(Implicit):
             self.velocity_back,
             state.status,
         ]
-        return Launch("fibers", make_rod_step(p.name), model.fiber_count, inputs, split=True)
+        kernel = make_rod_step(p.name, self.module)
+        return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ BLOCK_SHARE = 32
 
 
 @cache
-def make_chain_response(name: str, has_frozen: bool) -> Any:
+def make_chain_response(name: str, has_frozen: bool, module: str = "unique") -> Any:
     """Kernel `chain_response`, one thread per fiber: shift and tensions by the forces found."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
@@ -32,7 +32,7 @@ def make_chain_response(name: str, has_frozen: bool) -> Any:
     gather_push = make_gather_push(name)
     zero = real(0.0)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def chain_response(
         offset: wp.int32,
         row_stride: wp.int32,
@@ -104,7 +104,7 @@ def make_chain_response(name: str, has_frozen: bool) -> Any:
 
 
 @cache
-def make_chain_apply(name: str) -> Any:
+def make_chain_apply(name: str, module: str = "unique") -> Any:
     """Kernel `chain_apply`, one thread per fiber: moved by its shift, tensions added.
 
     `carried`: share of the shift's velocity that `node_velocity` takes up.
@@ -113,7 +113,7 @@ def make_chain_apply(name: str) -> Any:
     real, vec3 = p.real, p.vec3
     chi = real(CHI)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def chain_apply(
         offset: wp.int32,
         carried: real,
@@ -258,7 +258,7 @@ class ChainResponse:
         """Shift and tensions of the solution."""
         model = self.model
         inputs = [*self._fibers(dual), *self._rows(dual), dual.state.status, *self._work(dual)]
-        kernel = make_chain_response(model.precision.name, dual.has_frozen)
+        kernel = make_chain_response(model.precision.name, dual.has_frozen, dual.module)
         return [Launch("chain_response", kernel, model.fiber_count, inputs, split=True)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
@@ -276,7 +276,7 @@ class ChainResponse:
             state.node_velocity,
             self.tension,
         ]
-        kernel = make_chain_apply(model.precision.name)
+        kernel = make_chain_apply(model.precision.name, dual.module)
         return Launch("chain_apply", kernel, model.fiber_count, inputs, split=True)
 
 

@@ -155,7 +155,7 @@ def make_crossing(planar: float):
 
 
 @cache
-def make_check_sweeps(name: str, features: CheckFeatures):
+def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"):
     """`check_segments`, `reduce_check`, `finish_check` in launch order, as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -168,7 +168,7 @@ def make_check_sweeps(name: str, features: CheckFeatures):
     lost = real(1e30)
     periodic = features.periodic
     has_walls = any(features.walls)
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.kernel(**options)
     def check_segments(

@@ -13,7 +13,9 @@ import warp as wp
 
 from warpfiber.model import Model, State
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
+from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.neighbors import NeighborList
 
@@ -48,8 +50,10 @@ class ContactCheck:
         none = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
         features = CheckFeatures(any(domain.periodic), domain.wall, fiber_frozen is not None)
-        self.kernels = dict(make_check_sweeps(name, features))
-        self.kernels |= make_list_bound(name)
+        module = kernel_module("check", name, features)
+        self.kernels = dict(make_check_sweeps(name, features, module))
+        self.kernels |= make_list_bound(name, module)
+        self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
         self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
         self.overlap_partner, self.crossed = self._int(segments), self._int(segments)

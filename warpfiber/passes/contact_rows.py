@@ -18,11 +18,12 @@ import warp as wp
 
 from warpfiber.model import Model, State
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
 
-KEEP = 0.2  # radii of the thinner fiber: rows with a smaller predicted gap are kept
+KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 GROWTH = 1.3
 
 
@@ -55,8 +56,10 @@ class ContactRows:
         self.keep = keep
         domain = model.domain
         self.features = RowFeatures(any(domain.periodic), domain.wall, lubrication)
-        self.kernels = dict(make_row_count(model.precision.name, self.features))
-        self.kernels["fill_rows"] = make_row_fill(model.precision.name, self.features)
+        name, features = model.precision.name, self.features
+        module = kernel_module("rows", name, features)
+        self.kernels = dict(make_row_count(name, features, module))
+        self.kernels["fill_rows"] = make_row_fill(name, features, module)
         segments = model.segment_count
         self.row_out_start = self._int(segments + 1)
         self.carried_start = self._int(segments + 1)

@@ -13,10 +13,10 @@ from warpfiber.passes.step_control import AGAIN, HALVE, KEEP
 
 
 @cache
-def make_contact_verdict():
+def make_contact_verdict(module: str = "unique"):
     """Kernels `gate_list` and `judge_contacts`, one thread each, by name."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def gate_list(
         list_short: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -28,7 +28,7 @@ def make_contact_verdict():
             status[wp.static(HALT)] = 1
             rejected_out[0] = 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def judge_contacts(
         most_overlap: wp.float64,
         first_need: wp.array(dtype=wp.int32),

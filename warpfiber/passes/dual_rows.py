@@ -35,12 +35,12 @@ def rows_begin(count: wp.int32, chunk: wp.int32, chunks: wp.int32) -> wp.int32:
 
 
 @cache
-def make_dual_step(name: str):
+def make_dual_step(name: str, module: str = "unique"):
     """Kernel `dual_step` (rows in chunks): the next forces, or the end of the solve."""
     real = precision(name).real
     zero, first_step = real(0.0), wp.constant(FIRST_STEP)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def dual_step(
         offset: wp.int32,
         chunks: wp.int32,
@@ -118,7 +118,7 @@ def make_dual_step(name: str):
 
 
 @cache
-def make_dual_balance(name: str, law: str, by_ends: bool):
+def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"):
     """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
 
     `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`.
@@ -129,7 +129,7 @@ def make_dual_balance(name: str, law: str, by_ends: bool):
     zero, one = real(0.0), real(1.0)
     broken = real(BROKEN)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def dual_balance(
         offset: wp.int32,
         chunks: wp.int32,
@@ -218,10 +218,10 @@ def make_dual_balance(name: str, law: str, by_ends: bool):
 
 
 @cache
-def make_fold_sums():
+def make_fold_sums(module: str = "unique"):
     """Kernel `fold_sums`: the sums of many chunks as those of `folds` runs of them."""
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def fold_sums(
         chunks: wp.int32,
         folds: wp.int32,

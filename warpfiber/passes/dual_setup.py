@@ -26,7 +26,7 @@ from warpfiber.passes.precision import group_struct
 
 
 @cache
-def make_dual_begin(name: str, law: str, has_frozen: bool):
+def make_dual_begin(name: str, law: str, has_frozen: bool, module: str = "unique"):
     """Kernel `dual_begin` (rows in chunks): nodes and weight of every row, warm start, control."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
@@ -62,7 +62,7 @@ def make_dual_begin(name: str, law: str, has_frozen: bool):
         weight = segments * g.weight + two * g.weight_excess
         return point_mobility(g.drag, g.torque, beads, weight, g.rest * arc, along)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def dual_begin(
         offset: wp.int32,
         chunks: wp.int32,
@@ -171,7 +171,7 @@ def make_dual_begin(name: str, law: str, has_frozen: bool):
 
 
 @cache
-def make_dual_lists(name: str):
+def make_dual_lists(name: str, module: str = "unique"):
     """Kernel `dual_lists`, one thread per fiber: its rows as a partner, its shift cleared.
 
     `fiber_in` is the first such row, `row_next` the next of each, -1 at the end; in the order of
@@ -179,7 +179,7 @@ def make_dual_lists(name: str):
     """
     vec3 = precision(name).vec3
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def dual_lists(
         offset: wp.int32,
         fiber_node_start: wp.array(dtype=wp.int32),

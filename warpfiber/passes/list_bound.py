@@ -18,12 +18,12 @@ from warpfiber.model import HALT, precision
 
 
 @cache
-def make_list_bound(name: str):
+def make_list_bound(name: str, module: str = "unique"):
     """`bound_fibers` and `bound_list` in launch order, as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     zero, half, one = real(0.0), real(0.5), real(1.0)
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func
     def farthest_motion(affine: mat33, sizes: wp.array(dtype=real)) -> real:

@@ -43,7 +43,7 @@ def rod_map(name: str) -> Any:
 
 
 @cache
-def make_rod_maps(name: str):
+def make_rod_maps(name: str, module: str = "unique"):
     """Kernel `rod_maps`: the map of every shape, one thread each, in float64.
 
     `shape_mu`: (1 - lambda_J)/2 of every shape; `shape_settling`: v_s.
@@ -53,7 +53,7 @@ def make_rod_maps(name: str):
     RodMap = rod_map(name)
     _, exponential_change = make_exponential()
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def rod_maps(
         rate: wp.float64,
         full_gradient: wp.mat33d,
@@ -93,7 +93,7 @@ def make_rod_maps(name: str):
 
 
 @cache
-def make_rod_step(name: str):
+def make_rod_step(name: str, module: str = "unique"):
     """Kernel `rod_step`: one step of every rod; rod f has the nodes 2 f and 2 f + 1.
 
     `keeps`: steps may be rejected, so the start is kept. `rod_shape`: which map moves a rod.
@@ -105,7 +105,7 @@ def make_rod_step(name: str):
     flow_velocity, _ = make_flow(name)
     half, endless = real(0.5), real(1.0e30)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def rod_step(
         offset: wp.int32,
         keeps: wp.int32,

@@ -22,7 +22,7 @@ from warpfiber.passes.unilateral import ContactDual
 
 
 @cache
-def make_rod_response(name: str, has_frozen: bool):
+def make_rod_response(name: str, has_frozen: bool, module: str = "unique"):
     """Kernel `rod_response`, one thread per rod: forces of its rows gathered, shift of its ends."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
@@ -30,7 +30,7 @@ def make_rod_response(name: str, has_frozen: bool):
     turning_drag, _ = make_rod_mobility(name)
     one, half = real(1.0), real(0.5)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def rod_response(
         offset: wp.int32,
         step_size: wp.array(dtype=wp.float64),
@@ -85,7 +85,7 @@ def make_rod_response(name: str, has_frozen: bool):
 
 
 @cache
-def make_rod_apply(name: str):
+def make_rod_apply(name: str, module: str = "unique"):
     """Kernel `rod_apply`, one thread per rod: moved by its shift, its length as at rest.
 
     `carried`: share of the shift's velocity that `node_velocity` takes up.
@@ -95,7 +95,7 @@ def make_rod_apply(name: str):
     Group = group_struct(name)
     half = real(0.5)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def rod_apply(
         offset: wp.int32,
         carried: real,
@@ -164,7 +164,7 @@ class RodResponse:
             dual.control,
             dual.node_shift,
         ]
-        kernel = make_rod_response(model.precision.name, dual.has_frozen)
+        kernel = make_rod_response(model.precision.name, dual.has_frozen, dual.module)
         return Launch("rod_response", kernel, model.fiber_count, inputs, split=True)
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
@@ -180,5 +180,5 @@ class RodResponse:
             state.node_pos,
             state.node_velocity,
         ]
-        kernel = make_rod_apply(model.precision.name)
+        kernel = make_rod_apply(model.precision.name, dual.module)
         return Launch("rod_apply", kernel, model.fiber_count, inputs, split=True)

@@ -36,7 +36,7 @@ class RowFeatures:
 
 
 @cache
-def make_row_count(name: str, features: RowFeatures):
+def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
     """`carry_rows`, `count_rows`, `limit_rows` in launch order, as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -52,7 +52,7 @@ def make_row_count(name: str, features: RowFeatures):
     periodic = features.periodic
     has_lubrication = features.lubrication != "none"
     has_walls = any(features.walls)
-    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
+    options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.kernel(**options)
     def carry_rows(

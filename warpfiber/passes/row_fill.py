@@ -27,7 +27,7 @@ KEY_BEADS = (7, 8209, 131101)
 
 
 @cache
-def make_row_fill(name: str, features: RowFeatures):
+def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
     """Kernel `fill_rows` in the given precision with the given features, over segments."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -69,7 +69,7 @@ def make_row_fill(name: str, features: RowFeatures):
                 return carried_force[q]
         return zero
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def fill_rows(
         offset: wp.int32,
         keep: real,

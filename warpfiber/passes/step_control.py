@@ -26,7 +26,7 @@ SMALLEST_SHARE = 1e-9  # of the largest step: below it a fiber that is still rej
 
 
 @cache
-def make_step_begin(name: str, sheared: bool = False):
+def make_step_begin(name: str, sheared: bool = False, module: str = "unique"):
     """Kernel `step_begin` (one thread): what the step is made with; halts until the host looked.
 
     Gradients of both stages; lattice at start and end; deformation of the list's end.
@@ -45,7 +45,7 @@ def make_step_begin(name: str, sheared: bool = False):
         middle = strain + half * rate_factor(strain, schedule)
         return strain + wp.float64(2.0) * half * rate_factor(middle, schedule)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def step_begin(
         rate: wp.float64,
         full_gradient: wp.mat33d,
@@ -84,11 +84,11 @@ def make_step_begin(name: str, sheared: bool = False):
 
 
 @cache
-def make_largest_error(name: str):
+def make_largest_error(name: str, module: str = "unique"):
     """Kernel `largest_error`: largest error of every run of fibers, and its fiber."""
     real = precision(name).real
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def largest_error(
         chunks: wp.int32,
         fiber_error: wp.array(dtype=real),
@@ -113,7 +113,9 @@ def make_largest_error(name: str):
 
 
 @cache
-def make_step_end(name: str, sheared: bool, adaptive: bool, judged: bool = False):
+def make_step_end(
+    name: str, sheared: bool, adaptive: bool, judged: bool = False, module: str = "unique"
+):
     """Kernel `step_end` (one thread): accept or not, advance the time, choose the next step.
 
     `judged`: a verdict on the contacts of the step may ask for half of it (1) or for the same again
@@ -122,7 +124,7 @@ def make_step_end(name: str, sheared: bool, adaptive: bool, judged: bool = False
     mat33 = precision(name).mat33
     rate_factor, lattice_push = make_flow_history()
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def step_end(
         full_gradient: wp.mat33d,
         schedule: wp.array(dtype=wp.vec2d),
@@ -197,7 +199,7 @@ def make_step_end(name: str, sheared: bool, adaptive: bool, judged: bool = False
 
 
 @cache
-def make_take_back(name: str, tense: bool = True):
+def make_take_back(name: str, tense: bool = True, module: str = "unique"):
     """Kernel `take_back`: every fiber as before a rejected step, one thread per fiber.
 
     `tense`: segments carry a tension from step to step.
@@ -205,7 +207,7 @@ def make_take_back(name: str, tense: bool = True):
     p = precision(name)
     real, vec3 = p.real, p.vec3
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def take_back(
         offset: wp.int32,
         rejected: wp.array(dtype=wp.int32),

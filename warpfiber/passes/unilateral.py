@@ -24,6 +24,7 @@ from warpfiber.passes.dual_rows import (
 )
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.kernel_module import kernel_module
 
 ROW_CHUNKS = 16  # runs of rows on the CPU: enough for the workers, few sums to add
 CUDA_CHUNKS = 16384, 32  # on CUDA, where their sums are folded before they are added
@@ -111,6 +112,9 @@ class ContactDual:
         self.has_frozen = fiber_frozen is not None
         none = wp.zeros(0, dtype=wp.uint8, device=device)
         self.fiber_frozen = fiber_frozen if self.has_frozen else none
+        self.module = kernel_module(
+            "dual", model.precision.name, self.law.kind, self.has_frozen, response.by_ends
+        )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
         self.fiber_in = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
         # runs of rows, and of their sums (0: these are not folded)
@@ -144,7 +148,7 @@ class ContactDual:
         update: list[Launch | Call] = [self._step(), self.response.repeat(self), self._balance()]
         if self.folds:
             inputs = [self.chunks, self.folds, self.sums, self.control, self.folded]
-            update.append(Launch("fold_sums", make_fold_sums(), self.folds, inputs))
+            update.append(Launch("fold_sums", make_fold_sums(self.module), self.folds, inputs))
         repeat = Repeat("dual", update, self.going, self.most + 3)
         return [*before, repeat, *self.response.end(self)]
 
@@ -181,7 +185,8 @@ class ContactDual:
             self.control,
             self.going,
         ]
-        kernel = make_dual_begin(model.precision.name, self.law.kind, self.has_frozen)
+        name = model.precision.name
+        kernel = make_dual_begin(name, self.law.kind, self.has_frozen, self.module)
         return Launch("dual_begin", kernel, self.chunks, inputs, split=True)
 
     def _lists(self) -> Launch:
@@ -198,7 +203,7 @@ class ContactDual:
             self.fiber_in,
             self.node_shift,
         ]
-        kernel = make_dual_lists(model.precision.name)
+        kernel = make_dual_lists(model.precision.name, self.module)
         # nothing of what the first launch made is read here
         return Launch("dual_lists", kernel, model.fiber_count, inputs, split=True, follows=True)
 
@@ -219,7 +224,7 @@ class ContactDual:
             self.best,
             self.control,
         ]
-        kernel = make_dual_step(self.model.precision.name)
+        kernel = make_dual_step(self.model.precision.name, self.module)
         return Launch("dual_step", kernel, self.chunks, inputs, split=True)
 
     def _balance(self) -> Launch:
@@ -248,7 +253,8 @@ class ContactDual:
             self.control,
             self.going,
         ]
-        kernel = make_dual_balance(self.model.precision.name, self.law.kind, self.response.by_ends)
+        name, by_ends = self.model.precision.name, self.response.by_ends
+        kernel = make_dual_balance(name, self.law.kind, by_ends, self.module)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------
