@@ -99,6 +99,12 @@ _FIGURES = (
         logarithmic=True,
     ),
     Curves(
+        "pressure",
+        "Pressure on walls",
+        "pressure (Pa)",
+        {"pressure_low": ("lower", _ORANGE), "pressure_high": ("upper", _BLUE)},
+    ),
+    Curves(
         "axial_strain",
         "Axial strain of segments",
         "largest |axial strain|",
