@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,7 @@ from warpfiber.passes.step_control import (
     make_step_end,
     make_take_back,
 )
+from warpfiber.passes.wall_press import make_push_sum, make_wall_meter, make_wall_motion
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
@@ -197,6 +198,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
             (True, True),
         ),
         ("bed", bed, (False, True)),
+        ("pressed bed", replace(bed, press=2), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
 
@@ -236,6 +238,9 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
     yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
     yield "carry_memory", "", make_carry_memory(precision)
+    yield "move_walls", "", make_wall_motion(2)
+    yield "sum_pushes", "", make_push_sum()
+    yield "meter_walls", "", make_wall_meter(2)
     yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from warpfiber.passes.bond_drift import make_bond_drift
@@ -99,7 +98,6 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
 def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     """Loads of bonds, walls and gathered pairs, and the kicks (see `make_bond_sweep`)."""
     model, state, p = spheres.model, spheres.state, spheres.model.precision
-    low, high = wall_places(spheres)
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
     gathered: list[Any] = [none_i, none_i, none_i, spheres.pair_acts, none_3, none_3]
@@ -110,8 +108,9 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
     inputs = [
         p.real(spheres.dt),
-        low,
-        high,
+        spheres.press.place,
+        spheres.press.velocity,
+        spheres.press.fiber_push,
         p.real(spheres.scene.contact.damping),
         p.real(spheres.scene.contact.wall_friction),
         spheres.stage,
@@ -137,9 +136,3 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     ]
     kernel = make_bond_sweep(p.name, spheres.features, drifts, kicks)
     return Launch("bonds", kernel, model.fiber_count, inputs, split=True)
-
-
-def wall_places(spheres: BondedSpheres) -> tuple[Any, Any]:
-    """Lower and upper corner of the box."""
-    low = np.asarray(spheres.model.domain.low)
-    return wp.vec3d(*low), wp.vec3d(*(low + np.asarray(spheres.model.domain.size)))

@@ -1,11 +1,12 @@
 """Fibers as spheres joined by elastic bonds, after Xu, Ma & Guo 2023: translation and rotation.
 
 A step: clock, bonds (kick, drift, loads of bonds, walls, weight and single nodes, kick). Where
-fibers meet, drift (kick, drift), pairs (contact of segments) and bonds (loads, kick).
+fibers meet, drift (kick, drift), pairs (contact of segments) and bonds (loads, kick). Walls move
+after the clock and are metered in the end.
 Source: bonds in total form with the placed shape as the stress-free one (`laws.bond`), velocity
     Verlet, contacts by Hertz, Mindlin and Coulomb. The paper adds up bond moments step by step;
     here they follow from the state.
-Limits: walls are planes at rest; dt below `stability.step_limits`.
+Limits: walls are planes of the box; dt below `stability.step_limits`.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from warpfiber.methods.bonded_launches import (
     clock_launch,
     drift_launch,
     pair_launch,
-    wall_places,
 )
 from warpfiber.methods.loads import node_loads
 from warpfiber.methods.method import Method
+from warpfiber.methods.press import Press
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes import held_nodes
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
@@ -45,6 +46,7 @@ from warpfiber.passes.executor import Call, Executor, Launch, Repeat
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
+from warpfiber.scene.pressing import PRESSING
 
 STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
@@ -66,6 +68,7 @@ class BondedSpheres(Method):
         super().__init__(scene, model, state, dt, workers)
         p, device, nodes = model.precision, model.device, model.node_count
         self.started = False
+        self.press = Press(scene, model, state, self.dt)
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
@@ -73,6 +76,7 @@ class BondedSpheres(Method):
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
             wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
+            press=self.press.axis,
         )
         self.groups = wp.array(
             [self._group(group) for group in scene.fibers],
@@ -170,13 +174,15 @@ class BondedSpheres(Method):
 
     def launches(self) -> list[Launch | Call | Repeat]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
+        begin, end = [clock_launch(self), *self.press.motion()], self.press.meter()
         if self.contacts is None:
-            return [clock_launch(self), bond_launch(self, drifts=True, kicks=True)]
+            return [*begin, bond_launch(self, drifts=True, kicks=True), *end]
         return [
-            clock_launch(self),
+            *begin,
             drift_launch(self),
             pair_launch(self, self.dt),
             bond_launch(self, drifts=False, kicks=True),
+            *end,
         ]
 
     @property
@@ -241,15 +247,21 @@ class BondedSpheres(Method):
         self.stage.assign(numbers)
         if not resumed:
             self.still_steps.zero_()
+            nodes = self.place if self.started else self.state.node_pos
+            self.press.begin(stage, nodes.numpy().astype(float))
 
     def steps_left(self, stage: Stage) -> int | None:
-        """Steps before which `end_speed` surely does not end the stage; None without it."""
+        """Steps before which no condition but strain and time surely ends the stage."""
+        if stage.kind in PRESSING:
+            return self.press.steps_left(stage, self.step_count)
         if stage.end_speed is None:
             return None
         return max(0, self.still_needed - int(self.still_steps.numpy().min()))
 
     def unmet(self, stage: Stage) -> str:
-        """What `end_speed` still waits for."""
+        """What the stage still waits for."""
+        if stage.kind in PRESSING:
+            return self.press.unmet(stage)
         if stage.end_speed is None:
             return ""
         velocity = self.state.node_velocity.numpy().astype(float)
@@ -259,12 +271,14 @@ class BondedSpheres(Method):
     # -- what is saved and told -------------------------------------------------------------------
 
     def measure(self) -> dict[str, float]:
-        """Energies in J, where `record.quantities` asks for them."""
+        """Energies in J and what walls feel, where `record.quantities` asks for them."""
+        pressed = self.press.measure()
         if "energy" not in self.scene.record.quantities:
-            return {}
+            return pressed
         model, walls = self.model, self.features.walls
         inputs = [
-            *wall_places(self),
+            wp.vec3d(*self.press.corners.mean(axis=0)),
+            self.press.place,
             self.groups,
             model.fiber_node_start,
             model.fiber_group,
@@ -280,7 +294,7 @@ class BondedSpheres(Method):
         )
         absent = {"gravity"} if self.scene.gravity is None else set()
         absent |= set() if any(walls) else {"wall"}
-        return {
+        return pressed | {
             f"energy_{name}": found[name] * model.units.energy
             for name in ENERGIES
             if name not in absent
@@ -289,12 +303,14 @@ class BondedSpheres(Method):
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        arrays |= self.press.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"bonds_{name}"])
+        self.press.restore(arrays)
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)

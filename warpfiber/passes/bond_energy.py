@@ -48,8 +48,8 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_bonds(
-        wall_low: wp.vec3d,
-        wall_high: wp.vec3d,
+        middle: wp.vec3d,
+        wall_place: wp.array(dtype=wp.vec3d),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -65,7 +65,6 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
         g = groups[fiber_group[fiber]]
         first = fiber_node_start[fiber]
         last = fiber_node_start[fiber + 1] - 1
-        middle = wp.float64(0.5) * (wall_low + wall_high)
         half = wp.float64(0.5)
         kinetic = wp.float64(0.0)
         gravity = wp.float64(0.0)
@@ -81,7 +80,7 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
             kinetic += half * (moving + inertia * wp.length_sq(wp.vec3d(node_spin[i])))
             gravity -= mass * wp.dot(wp.vec3d(g.weight), place[i] - middle)
             if wp.static(has_walls):
-                wall += walls_energy(g, place[i], wall_low, wall_high)
+                wall += walls_energy(g, place[i], wall_place[0], wall_place[1])
             j = i + 1
             if i == last:
                 j = first

@@ -34,6 +34,7 @@ class BondFeatures:
     closed: bool = False  # some fibers are rings
     pairs: bool = False
     wall_friction: bool = False
+    press: int = -1  # axis whose walls may move and are metered
 
 
 @cache
@@ -48,9 +49,9 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     Node = node_struct(name)
     bond_loads, _, bond_dashpots = make_bond(name)
     turned = make_rotation(name)
-    wall_loads = make_node_walls(name, features.walls, features.wall_friction)
+    wall_loads = make_node_walls(name, features.walls, features.wall_friction, features.press)
     gather_pairs = make_gather(name)
-    has_walls = any(features.walls)
+    has_walls, is_metered = any(features.walls), features.press >= 0
     has_dashpots, has_loads = features.dashpots, features.loads
     has_rings, has_pairs = features.closed, features.pairs
     is_single = name == "float32"
@@ -98,8 +99,9 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     def bond_sweep(
         offset: wp.int32,
         dt: real,
-        wall_low: wp.vec3d,
-        wall_high: wp.vec3d,
+        wall_place: wp.array(dtype=wp.vec3d),
+        wall_velocity: wp.array(dtype=wp.vec2d),
+        fiber_push: wp.array(dtype=wp.vec2d),
         wall_damping: real,
         wall_friction: real,
         stage: wp.array(dtype=real),
@@ -141,6 +143,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         torn2 = g.torn_length * g.torn_length
         torn = wp.int32(0)
         fastest2 = zero
+        pushed = wp.vec2d()
 
         # A ring's last bond pulls at the first node now and at the last node in the end.
         force = nothing
@@ -211,7 +214,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 step = zero
                 if wp.static(kicks):
                     step = dt
-                push, couple = wall_loads(
+                push, couple, pushes = wall_loads(
                     g,
                     wall_damping,
                     wall_friction,
@@ -219,13 +222,15 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     mass,
                     i,
                     node,
-                    wall_low,
-                    wall_high,
+                    wall_place,
+                    wall_velocity,
                     wall_memory,
                     wall_stiffness,
                 )
                 force += push
                 moment += couple
+                if wp.static(is_metered):
+                    pushed += pushes
             hold = wp.int32(0)
             if wp.static(has_loads):
                 hold = node_hold[i]
@@ -259,6 +264,8 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
             force = force_after
             moment = moment_after
 
+        if wp.static(is_metered):
+            fiber_push[fiber] = pushed
         if wp.static(kicks):
             count = wp.int32(0)
             if fastest2 < stage[wp.static(END_SPEED)]:

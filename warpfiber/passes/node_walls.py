@@ -1,6 +1,7 @@
 """Contact of one node with the plane walls of the box: Hertz, dashpot, friction with memory.
 
-Source: laws `hertz` and `friction`; walls are rigid and at rest.
+Source: laws `hertz` and `friction`; walls are rigid. Those of axis `press` move along their normal,
+    and what they push with is told.
 """
 
 from functools import cache
@@ -16,8 +17,11 @@ SIDES = 6  # places of a node's memories: axis by axis, low before high
 
 
 @cache
-def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: bool):
-    """`wall_loads`: force and moment of all walls on a node; memories move on by dt."""
+def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: bool, press: int):
+    """`wall_loads`: force and moment of all walls on a node; memories move on by dt.
+
+    Third, the pushes of the two walls of axis `press` (-1: none).
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     BondGroup = bond_group_struct(name)
@@ -38,11 +42,15 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         node: Node,
         n: vec3,
         gap: real,
+        approach: real,
         slot: wp.int32,
         memories: wp.array(dtype=vec3),
         stiffnesses: wp.array(dtype=real),
     ):
-        """n points into the box; gap from the wall to the center."""
+        """n points into the box; gap from the wall to the center; approach: speed of the wall.
+
+        Force, moment and push; the approach counts along n.
+        """
         force = vec3(zero, zero, zero)
         moment = vec3(zero, zero, zero)
         depth = g.radius - gap
@@ -50,9 +58,9 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
             if wp.static(has_friction):
                 if stiffnesses[slot] != zero:
                     stiffnesses[slot] = zero
-            return force, moment
+            return force, moment, zero
         k = plane_stiffness(g.wall_modulus, g.radius, depth)
-        speed = wp.dot(node.v, n)
+        speed = wp.dot(node.v, n) - approach
         size = plane_push(k, beta, mass, depth, speed)
         if wp.static(has_friction):
             arm = -gap * n
@@ -68,7 +76,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
             memories[slot] = memory
             stiffnesses[slot] = stiffness
             moment = wp.cross(arm, force)
-        return force + size * n, moment
+        return force + size * n, moment, size
 
     @wp.func
     def wall_loads(
@@ -79,13 +87,14 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         mass: real,
         i: wp.int32,
         node: Node,
-        low: wp.vec3d,
-        high: wp.vec3d,
+        wall_place: wp.array(dtype=wp.vec3d),
+        wall_velocity: wp.array(dtype=wp.vec2d),
         memories: wp.array(dtype=vec3),
         stiffnesses: wp.array(dtype=real),
     ):
         force = vec3(zero, zero, zero)
         moment = vec3(zero, zero, zero)
+        pushes = wp.vec2d()
         for axis in range(3):
             has_wall = wp.static(wall_x)
             if axis == 1:
@@ -96,10 +105,13 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                 for side in range(2):
                     n = vec3(zero, zero, zero)
                     n[axis] = real(1 - 2 * side)
-                    gap = real(node.x[axis] - low[axis])
+                    gap = real(node.x[axis] - wall_place[side][axis])
                     if side == 1:
-                        gap = real(high[axis] - node.x[axis])
-                    push, couple = one_wall(
+                        gap = -gap
+                    approach = zero
+                    if axis == wp.static(press):
+                        approach = n[axis] * real(wall_velocity[0][side])
+                    push, couple, size = one_wall(
                         g,
                         beta,
                         friction,
@@ -108,12 +120,15 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                         node,
                         n,
                         gap,
+                        approach,
                         wp.static(SIDES) * i + 2 * axis + side,
                         memories,
                         stiffnesses,
                     )
                     force += push
                     moment += couple
-        return force, moment
+                    if axis == wp.static(press):
+                        pushes[side] = wp.float64(size)
+        return force, moment, pushes
 
     return wall_loads

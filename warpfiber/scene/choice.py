@@ -122,7 +122,7 @@ def _weight(draft: Draft, group: Values) -> float:
         return 0.0
     volume = fiber_volume("cylinder", group["diameter"], group["length"])
     lift = abs(density - (gravity["fluid_density"] or 0.0))
-    return lift * volume * math.hypot(*(gravity["acceleration"] or (0.0,)))
+    return float(lift * volume * math.hypot(*(gravity["acceleration"] or (0.0,))))
 
 
 def _group_error(

@@ -14,6 +14,7 @@ from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
+from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.tables import strain_rate
 
@@ -44,6 +45,7 @@ def cross_check(draft: Draft) -> None:
     _check_stages(draft)
     _check_rest(draft)
     check_loads(draft)
+    check_pressing(draft)
 
 
 def _check_tables(draft: Draft) -> None:

@@ -12,6 +12,7 @@ from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.keys import Values
+from warpfiber.scene.pressing import PRESSING, passing_time
 from warpfiber.scene.statistics import resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
@@ -254,13 +255,18 @@ def _resolve_contact(draft: Draft) -> None:
 
 
 def _resolve_stages(draft: Draft) -> None:
-    """Name the stages, and limit the time of those that no strain or time ends."""
+    """Name the stages, and limit the time of those that no strain or time ends.
+
+    A wall on its way limits it by itself.
+    """
     for index, stage in enumerate(draft.stages):
         if stage["name"] is None:
             stage["name"] = stage["kind"]
         ended = any(draft.is_given(f"stage.{index}.{key}") for key in ("end_strain", "end_time"))
         if stage["time_limit"] is None and not ended:
-            stage["time_limit"] = 100.0
+            stage["time_limit"] = passing_time(draft, stage) or 100.0
+        if stage["kind"] in PRESSING and stage["control"] is None:
+            stage["control"] = "displacement"
         if stage["repeat"] is None:
             stage["repeat"] = 1
 

@@ -34,7 +34,7 @@ class Stage:
     """One `[[stage]]`: what happens until its first end condition, counted from its start."""
 
     kind: str
-    """flow, settle"""
+    """flow, settle, compress, unload"""
     name: str
     """the kind, if none was given"""
     save: bool = False
@@ -48,6 +48,12 @@ class Stage:
     """Pa"""
     time_limit: float | None = None
     """s; None where end_strain or end_time ends the stage"""
+    wall: str | None = None
+    """of the box, that moves in compress and unload: z+ and the like"""
+    speed: float | None = None
+    """m/s, of that wall"""
+    control: str | None = None
+    """displacement"""
     damping: float = 0.0
     """1/s on the velocities of the nodes, of `settle`"""
     repeat_from: str | None = None
