@@ -166,17 +166,19 @@ class Simulation:
         Raises Diverged if a fiber tears, BoxExhausted or SceneError if the flow or a stretched
         segment leaves the periodic box too small.
         """
-        end = self.method.strain_end
-        allowed = count if math.isinf(end) else min(count, self.steps_to(end, None))
-        if not self.method.advance(allowed):
-            raise Diverged(self._torn_report())
-        if allowed < count:
-            height = self.method.box_width * self.model.units.length
-            raise BoxExhausted(
-                f"stopped at strain {self.strain:.6g}: the flow has deformed the periodic box "
-                f"until its smallest height is {height:.4g} m "
-                "(longest segment + reach + skin); take a larger box or more segments"
-            )
+        target = self.step_count + count
+        while (left := target - self.step_count) > 0:
+            end = self.method.strain_end
+            allowed = left if math.isinf(end) else min(left, self.steps_to(end, None))
+            if allowed == 0:
+                height = self.method.box_width * self.model.units.length
+                raise BoxExhausted(
+                    f"stopped at strain {self.strain:.6g}: the flow has deformed the periodic box "
+                    f"until its smallest height is {height:.4g} m "
+                    "(longest segment + reach + skin); take a larger box or more segments"
+                )
+            if not self.method.advance(allowed):
+                raise Diverged(self._torn_report())
 
     def run(self, until: float | None = None, *, time: float | None = None) -> None:
         """Advance to the strain `until`, or to `time` in s; default: the end of the last stage.

@@ -16,7 +16,7 @@ SCENE = Path(__file__).parents[2] / "scenes" / "sasayama_2018" / "shear_cell.tom
 STIFF = 3.26e10  # Pa, S_eff = 1
 
 
-def cell(modulus: float, **keys: Any) -> wf.Scene:
+def cell(modulus: float, path: Path = SCENE, **keys: Any) -> wf.Scene:
     edge = 2.5e-4
     tables = {
         "box.size": [edge] * 3,
@@ -26,7 +26,7 @@ def cell(modulus: float, **keys: Any) -> wf.Scene:
         "numerics.tolerance": 1e-3,
         "fibers.0.youngs_modulus": modulus,
     }
-    return wf.load_scene(SCENE, tables | keys)
+    return wf.load_scene(path, tables | keys)
 
 
 @pytest.mark.parametrize(("stiffer", "tried"), [(1.0, False), (10.0, True), (1000.0, False)])
@@ -50,6 +50,20 @@ def test_trial_decides_by_the_forces() -> None:
     strict = cell(10.0 * STIFF, **{"numerics.tolerance": 0.8 * bent})
     assert after_trial(loose).numerics.method == "rigid_rod"
     assert after_trial(strict).numerics.method == "overdamped"
+
+
+@pytest.mark.parametrize("edge", [2.25e-4, 2.8e-4])
+def test_rods_that_fail_are_not_chosen(tmp_path: Path, edge: float) -> None:
+    """The box holds short segments for long, rods for less than the trial or not at all."""
+    path = tmp_path / "scene.toml"
+    text = SCENE.read_text().replace("simple_shear", "planar_extension")
+    path.write_text(text.replace("shear_rate", "extension_rate"))
+    scene = cell(10.0 * STIFF, path, **{"box.size": [edge] * 3})
+    assert scene.rod_trial is not None
+    chosen = after_trial(scene)
+    assert chosen.numerics.method == "overdamped"
+    assert chosen.rod_trial is None
+    assert "a trial of rods fails" in str(chosen.method_reason)
 
 
 def test_bending_of_the_last_contacts() -> None:

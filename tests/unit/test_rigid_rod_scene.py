@@ -131,6 +131,29 @@ def test_fibers_in_a_fluid_at_rest_are_rods() -> None:
         wf.Simulation(read(ROD, **keys))
 
 
+@pytest.mark.parametrize(
+    ("modulus", "method"), [(1e5, "overdamped"), (1e7, "overdamped"), (1e11, "rigid_rod")]
+)
+def test_weight_bends_what_lies_on_a_wall(modulus: float, method: str) -> None:
+    """W L^2/(75 E I) with W = 1500 pi a^2 L 9.81: 9e-2, 9e-4 and 9e-8 of L, tolerance 1e-3 / 10."""
+    keys: dict[str, object] = {
+        "flow__kind": "rest",
+        "box__size": [2e-3, 2e-3, 2e-3],
+        "box__boundary": ["periodic", "periodic", "wall"],
+        "contact__law": "exponential",
+        "gravity__fluid_density": 1000,
+        "stage__0__end_time": 1.0,
+        "fibers__0__youngs_modulus": modulus,
+        "fibers__0__aspect_ratio": 120,
+    }
+    scene = read(ROD, numerics__dt=0.01, **keys)
+    assert scene.numerics.method == method
+    assert scene.rod_trial is None
+    bent = 1500.0 * 9.81 * math.pi * 5e-6**2 * 1.2e-3**3
+    bent /= 75.0 * modulus * 0.25 * math.pi * 5e-6**4
+    assert f"under its weight up to {bent:.2g}".replace("e-0", "e-") in str(scene.method_reason)
+
+
 def test_check_and_run_name_method_and_reason(shell: Shell) -> None:
     path = shell.folder / "rod.toml"
     path.write_text(ROD)

@@ -10,6 +10,7 @@ import pytest
 
 import warpfiber as wf
 from warpfiber.model import EXPIRED
+from warpfiber.simulation import BoxExhausted
 
 CELL = """
 [box]
@@ -135,3 +136,22 @@ def test_timing_passes_leaves_nothing_pending(tmp_path: Path) -> None:
     simulation.pass_times(1)
     assert pairs.build_count == builds + 1
     assert simulation.state.status.numpy()[EXPIRED] == 0
+
+
+def test_short_steps_use_the_box_up(tmp_path: Path) -> None:
+    """Steps that a tolerance makes short end where the box is flat, not where long ones would."""
+    changes = {
+        "[1.5e-4, 1.5e-4, 1.5e-4]": "[2e-4, 2e-4, 2e-4]",
+        "simple_shear": "planar_extension",
+        "shear_rate": "extension_rate",
+        "count = 20": "count = 4",
+        '"bead_chain"': '"overdamped"\ntolerance = 1e-5',
+    }
+    text = CELL
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    simulation = wf.Simulation(scene(tmp_path, text))
+    with pytest.raises(BoxExhausted):
+        simulation.step(100_000)
+    assert simulation.strain == pytest.approx(simulation.method.strain_end, abs=0.01)
+    simulation.close()

@@ -50,6 +50,7 @@ class Curves:
     columns: Mapping[str, tuple[str, str]]
     ylim: tuple[float, float] | None = None
     logarithmic: bool = False
+    least: float = -np.inf  # what a value must exceed for the figure to be drawn
 
 
 _FIGURES = (
@@ -109,6 +110,7 @@ _FIGURES = (
         "largest |axial strain|",
         {"axial_strain_max": ("largest", _ORANGE)},
         ylim=(0.0, np.inf),
+        least=1e-9,  # rods do not stretch
     ),
     Curves(
         "angle", "Rotation in the flow-gradient plane", "mean angle (rad)", {"angle": ("", _BLUE)}
@@ -230,12 +232,17 @@ def _references(run: _Run) -> dict[str, Table]:
     return found
 
 
+def _known(curves: Curves, run: _Run) -> list[str]:
+    """Columns of the figure that a run has."""
+    return [name for name in curves.columns if _finite(run.table, name)]
+
+
 def _draw_curves(
     curves: Curves, runs: Sequence[_Run], references: Mapping[str, Table], path: Path
 ) -> bool:
     """Draw one figure and its CSV; false if no run has a column of it."""
-    drawn = [run for run in runs if any(_finite(run.table, name) for name in curves.columns)]
-    if not drawn:
+    drawn = [run for run in runs if _known(curves, run)]
+    if not any(np.nanmax(r.table[n]) > curves.least for r in drawn for n in _known(curves, r)):
         return False
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

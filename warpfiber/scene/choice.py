@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from warpfiber.scene.derived import bending_stiffness
+from warpfiber.scene.derived import bending_stiffness, fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import Fault, number_text, value_text
 from warpfiber.scene.keys import Values
@@ -75,7 +75,8 @@ def choose_method(read: Callable[[str], Draft]) -> Choice:
         if by_flow <= asked and error <= max(by_flow, asked / TRIAL_SPAN):
             candidates.insert(0, "rigid_rod")
         elif by_flow <= asked and error <= TRIAL_SPAN * asked:
-            if not read("rigid_rod").faults.faults:
+            flow = drafts["overdamped"].flow_object  # a trial is a strain of it
+            if flow is not None and flow.rate > 0.0 and not read("rigid_rod").faults.faults:
                 trial = asked
     fewest = math.inf
     best = Choice(candidates[-1], reason)
@@ -108,13 +109,25 @@ def rod_error(draft: Draft, contact: bool = True) -> tuple[float, str]:
         return math.inf, "the scene has no flow"
     pushes = contact and (draft.contact["law"] != "none" or bool(draft.axes("wall")))
     errors = [
-        _group_error(group, f"fibers.{index}", draft.flow_object, pushes)
+        _group_error(group, f"fibers.{index}", draft.flow_object, pushes, _weight(draft, group))
         for index, group in enumerate(draft.fibers)
     ]
     return max(errors, key=lambda found: found[0])
 
 
-def _group_error(group: Values, name: str, flow: Flow, pushes: bool) -> tuple[float, str]:
+def _weight(draft: Draft, group: Values) -> float:
+    """Weight less buoyancy of a fiber in N: what presses it on a wall or another fiber."""
+    gravity, density = draft.gravity, group["density"]
+    if gravity is None or density is None or not group["length"]:
+        return 0.0
+    volume = fiber_volume("cylinder", group["diameter"], group["length"])
+    lift = abs(density - (gravity["fluid_density"] or 0.0))
+    return float(lift * volume * math.hypot(*(gravity["acceleration"] or (0.0,))))
+
+
+def _group_error(
+    group: Values, name: str, flow: Flow, pushes: bool, weight: float
+) -> tuple[float, str]:
     if group["node_file"] is not None:
         return math.inf, f"the node file of {name} may hold bent fibers"
     if group["length_distribution"] is not None:
@@ -125,7 +138,10 @@ def _group_error(group: Values, name: str, flow: Flow, pushes: bool) -> tuple[fl
     if None in (ratio, diameter, length, bending, axial) or gradient is None:
         return math.inf, f"{name} is not known"
     if flow.rate == 0.0:
-        return 0.0, "nothing moves the fluid"
+        bent = contact_deflection(weight, length, 0.5 * diameter, bending)
+        if not pushes or weight == 0.0:
+            return 0.0, "nothing moves the fluid"
+        return bent, f"bending of {name} under its weight {_share(bent)}"
     factor = max(row[1] for row in flow.schedule or ((0.0, 1.0),))
     stiffness = bending_stiffness(bending, ratio, flow.viscosity * flow.rate * factor)
     if stiffness <= BUCKLING_STIFFNESS:
@@ -138,12 +154,14 @@ def _group_error(group: Values, name: str, flow: Flow, pushes: bool) -> tuple[fl
         errors[f"stretch of {name} by the flow"] = stretch
     if pushes:
         force = largest_contact_force(ratio, 0.5 * diameter, largest, flow.viscosity)
-        bent = contact_deflection(force, length, 0.5 * diameter, bending)
+        bent = contact_deflection(force + weight, length, 0.5 * diameter, bending)
         errors[f"bending of {name} by contact"] = bent
     cause = max(errors, key=lambda what: errors[what])
-    return errors[
-        cause
-    ], f"{cause} up to {number_text(float(f'{errors[cause]:.2g}'))} of its length"
+    return errors[cause], f"{cause} {_share(errors[cause])}"
+
+
+def _share(error: float) -> str:
+    return f"up to {number_text(float(f'{error:.2g}'))} of its length"
 
 
 def _named(fault: Fault) -> str:
