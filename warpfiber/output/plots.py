@@ -1,11 +1,10 @@
 """Figures of a run, drawn from its folder alone; each PNG lies beside a CSV with what it shows.
 
 Curves against strain (time, where nothing is strained): orientation, interactions, overlap, energy,
-axial strain, angle, and the tip of a few fibers; `cell.png` is a picture of the cell at the end.
+pressure on walls, axial strain, angle, and the tip of a few fibers; `cell.png` is a picture of the
+cell at the end.
 Points of `reference/*.csv` beside the scene are drawn over them: a header row with `strain` (or
 `time`) and columns named as in `scalars.csv` (`tip` for the tip); lines with # are comments.
-
-Symbols: a_ij orientation tensor; x, y, z = 1, 2, 3. Colors: x red, y green, z blue throughout.
 """
 
 from __future__ import annotations
@@ -19,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpfiber.output.cell_picture import AXIS_COLORS, draw_cell
+from warpfiber.output.cell_picture import draw_cell
+from warpfiber.output.curves import BLUE, FIGURES, GRAY, GREEN, INK, ORANGE, PURPLE, Curves
 from warpfiber.output.folder import ResultFolder
 from warpfiber.output.record_error import record_errors
 from warpfiber.output.scalars import read_scalars
@@ -31,91 +31,10 @@ if TYPE_CHECKING:
 Table = dict[str, NDArray[Any]]
 TIP_FIBERS = 10  # more curves than this say nothing
 _DPI = 160
-_INK, _GRAY = "#22262b", "#6b7280"
-_BLUE, _ORANGE, _GREEN, _PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
-_RED = "#c0445a"
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 _DECADES = 1e10
 """Largest ratio of the ends of a logarithmic axis."""
-
-
-@dataclass(frozen=True)
-class Curves:
-    """One figure: its file name, its words, and for each column a label and a color."""
-
-    name: str
-    title: str
-    ylabel: str
-    columns: Mapping[str, tuple[str, str]]
-    ylim: tuple[float, float] | None = None
-    logarithmic: bool = False
-    least: float = -np.inf  # what a value must exceed for the figure to be drawn
-
-
-_FIGURES = (
-    Curves(
-        "orientation",
-        "Orientation tensor",
-        "orientation tensor component",
-        {
-            "a11": ("$a_{11}$  flow", AXIS_COLORS[0]),
-            "a22": ("$a_{22}$  vorticity", AXIS_COLORS[1]),
-            "a33": ("$a_{33}$  gradient", AXIS_COLORS[2]),
-        },
-        ylim=(0.0, 1.0),
-    ),
-    Curves(
-        "interactions",
-        "Interactions and contacts",
-        "number per fiber",
-        {
-            "interactions_per_fiber": ("interactions", _BLUE),
-            "contacts_per_fiber": ("contacts", _ORANGE),
-            "coordination_number": ("touching fibers", _GREEN),
-        },
-        ylim=(0.0, np.inf),
-    ),
-    Curves(
-        "overlap",
-        "Overlap of fibers in contact",
-        "overlap / fiber radius",
-        {"overlap_max": ("largest", _ORANGE), "overlap_mean": ("mean", _BLUE)},
-        ylim=(0.0, np.inf),
-    ),
-    Curves(
-        "energy",
-        "Energies",
-        "energy (J)",
-        {
-            "energy_kinetic": ("kinetic", _BLUE),
-            "energy_stretching": ("stretching", _GREEN),
-            "energy_shear": ("shear", _RED),
-            "energy_bending": ("bending", _ORANGE),
-            "energy_twist": ("twist", _INK),
-            "energy_repulsion": ("repulsion", _PURPLE),
-            "energy_wall": ("walls", _GRAY),
-        },
-        logarithmic=True,
-    ),
-    Curves(
-        "pressure",
-        "Pressure on walls",
-        "pressure (Pa)",
-        {"pressure_low": ("lower", _ORANGE), "pressure_high": ("upper", _BLUE)},
-    ),
-    Curves(
-        "axial_strain",
-        "Axial strain of segments",
-        "largest |axial strain|",
-        {"axial_strain_max": ("largest", _ORANGE)},
-        ylim=(0.0, np.inf),
-        least=1e-9,  # rods do not stretch
-    ),
-    Curves(
-        "angle", "Rotation in the flow-gradient plane", "mean angle (rad)", {"angle": ("", _BLUE)}
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -142,7 +61,7 @@ def plot_run(folders: Any, out: str | Path | None = None) -> list[Path]:
         target.mkdir(parents=True, exist_ok=True)
     references = _references(runs[0])
     written = []
-    for curves in (*_FIGURES, _tip_curves(runs)):
+    for curves in (*FIGURES, _tip_curves(runs)):
         path = target / f"{curves.name}.png"
         if _draw_curves(curves, runs, references, path):
             written.append(path)
@@ -190,7 +109,7 @@ def _with_tips(table: Table, folder: ResultFolder) -> Table:
 def _tip_curves(runs: Iterable[_Run]) -> Curves:
     names = {name for run in runs for name in run.table if name.startswith("tip")}
     names -= {"tip_strain", "tip_time"}
-    shades = [_BLUE, _ORANGE, _GREEN, _PURPLE, "#c0487a", "#5b8a72", "#b59a2c", "#4a5ba8"]
+    shades = [BLUE, ORANGE, GREEN, PURPLE, "#c0487a", "#5b8a72", "#b59a2c", "#4a5ba8"]
     columns = {
         name: (name.replace("tip_", "fiber ").replace("tip", ""), shades[k % len(shades)])
         for k, name in enumerate(sorted(names))
@@ -319,13 +238,13 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
     scene = runs[0].scene
     strain = "shear strain" if _sheared(runs[0]) else "strain"
     words = {"strain": strain, "time": "time (s)"}
-    axes.set_xlabel(words.get(against, against), color=_INK)
-    axes.set_ylabel(curves.ylabel, color=_INK)
+    axes.set_xlabel(words.get(against, against), color=INK)
+    axes.set_ylabel(curves.ylabel, color=INK)
     words_of_scene = str(scene.get("title") or "")[:60] if len(runs) == 1 else ""
     # beside the title where both fit into the width, else below it
     beside = 1.5 * len(curves.title) + len(words_of_scene) < 62
     pad = 10 if beside or not words_of_scene else 24
-    axes.set_title(curves.title, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=pad)
+    axes.set_title(curves.title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=pad)
     if words_of_scene:
         axes.annotate(
             words_of_scene,
@@ -336,13 +255,13 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
             ha="right" if beside else "left",
             va="bottom",
             fontsize=9,
-            color=_GRAY,
+            color=GRAY,
         )
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color("#9aa1ab")
-    axes.tick_params(which="both", color="#9aa1ab", labelcolor=_GRAY, labelsize=9)
+    axes.tick_params(which="both", color="#9aa1ab", labelcolor=GRAY, labelsize=9)
     axes.grid(True, color="#e6e8eb", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.margins(x=0)
@@ -393,13 +312,13 @@ def _draw_legend(axes: Axes, runs: Sequence[_Run], references: Mapping[str, Tabl
     if len(runs) > 1:
         for k, run in enumerate(runs):
             dash = _DASHES[k % len(_DASHES)]
-            entries.append(Line2D([], [], color=_GRAY, linestyle=dash, label=run.label))
+            entries.append(Line2D([], [], color=GRAY, linestyle=dash, label=run.label))
     shown = {line.get_marker() for line in axes.get_lines()}
     for k, stem in enumerate(references):
         marker = "osD^v"[k % 5]
         if marker in shown:
             style: dict[str, Any] = {"marker": marker, "linestyle": "", "markerfacecolor": "white"}
-            entries.append(Line2D([], [], color=_GRAY, label=stem.replace("_", " "), **style))
+            entries.append(Line2D([], [], color=GRAY, label=stem.replace("_", " "), **style))
     if entries:
-        legend = axes.legend(handles=entries, framealpha=0.88, fontsize=9, labelcolor=_GRAY)
+        legend = axes.legend(handles=entries, framealpha=0.88, fontsize=9, labelcolor=GRAY)
         legend.get_frame().set_linewidth(0)

@@ -1,0 +1,95 @@
+"""What figures of a run show: columns of `scalars.csv`, their words and their colors.
+
+Symbols: a_ij orientation tensor; x, y, z = 1, 2, 3. Colors: x red, y green, z blue throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpfiber.output.cell_picture import AXIS_COLORS
+
+INK, GRAY = "#22262b", "#6b7280"
+BLUE, ORANGE, GREEN, PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
+RED = "#c0445a"
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One figure: its file name, its words, and for each column a label and a color."""
+
+    name: str
+    title: str
+    ylabel: str
+    columns: Mapping[str, tuple[str, str]]
+    ylim: tuple[float, float] | None = None
+    logarithmic: bool = False
+    least: float = -np.inf  # what a value must exceed for the figure to be drawn
+
+
+FIGURES = (
+    Curves(
+        "orientation",
+        "Orientation tensor",
+        "orientation tensor component",
+        {
+            "a11": ("$a_{11}$  flow", AXIS_COLORS[0]),
+            "a22": ("$a_{22}$  vorticity", AXIS_COLORS[1]),
+            "a33": ("$a_{33}$  gradient", AXIS_COLORS[2]),
+        },
+        ylim=(0.0, 1.0),
+    ),
+    Curves(
+        "interactions",
+        "Interactions and contacts",
+        "number per fiber",
+        {
+            "interactions_per_fiber": ("interactions", BLUE),
+            "contacts_per_fiber": ("contacts", ORANGE),
+            "coordination_number": ("touching fibers", GREEN),
+        },
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
+        "overlap",
+        "Overlap of fibers in contact",
+        "overlap / fiber radius",
+        {"overlap_max": ("largest", ORANGE), "overlap_mean": ("mean", BLUE)},
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
+        "energy",
+        "Energies",
+        "energy (J)",
+        {
+            "energy_kinetic": ("kinetic", BLUE),
+            "energy_stretching": ("stretching", GREEN),
+            "energy_shear": ("shear", RED),
+            "energy_bending": ("bending", ORANGE),
+            "energy_twist": ("twist", INK),
+            "energy_repulsion": ("repulsion", PURPLE),
+            "energy_wall": ("walls", GRAY),
+        },
+        logarithmic=True,
+    ),
+    Curves(
+        "pressure",
+        "Pressure on walls",
+        "pressure (Pa)",
+        {"pressure_low": ("lower", ORANGE), "pressure_high": ("upper", BLUE)},
+    ),
+    Curves(
+        "axial_strain",
+        "Axial strain of segments",
+        "largest |axial strain|",
+        {"axial_strain_max": ("largest", ORANGE)},
+        ylim=(0.0, np.inf),
+        least=1e-9,  # rods do not stretch
+    ),
+    Curves(
+        "angle", "Rotation in the flow-gradient plane", "mean angle (rad)", {"angle": ("", BLUE)}
+    ),
+)
