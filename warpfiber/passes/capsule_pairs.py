@@ -366,14 +366,16 @@ def make_carry_memory(name: str):
         i = wp.tid()
         for k in range(out_start[i], out_start[i + 1]):
             acts = wp.uint8(0)
+            memory = vec3()
             stiffness = real(0.0)
             for m in range(old_start[i], old_start[i + 1]):
                 if old_acts[m] != wp.uint8(0):
                     if old_j[m] == pair_j[k] and old_image[m] == pair_image[k]:
                         acts = wp.uint8(1)
-                        memory_out[k] = old_memory[m]
+                        memory = old_memory[m]
                         stiffness = old_stiffness[m]
             acts_out[k] = acts
+            memory_out[k] = memory
             stiffness_out[k] = stiffness
 
     return carry_memory

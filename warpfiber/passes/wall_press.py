@@ -13,7 +13,7 @@ import warp as wp
 from warpfiber.model import HALT
 
 CHUNK = 32  # fibers per thread
-AVERAGED = 200.0  # steps
+AVERAGED = 50.0  # steps
 
 
 @cache
