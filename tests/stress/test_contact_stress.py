@@ -26,7 +26,7 @@ from tests.reference.crossing import crossings
 from tests.stress.small_cell import Shell, shell
 from warpfiber.output import checkpoint_paths, read_checkpoint
 from warpfiber.scene import scene_from_dict
-from warpfiber.simulation import Simulation
+from warpfiber.simulation import Diverged, Simulation
 
 __all__ = ["shell"]  # a fixture
 REST = {"kind": "rest", "viscosity": 1.0}
@@ -302,3 +302,22 @@ def test_a_jam_ends_with_names_and_a_checkpoint(shell: Shell, method: str) -> No
     arrays, _ = read_checkpoint(path)
     assert all(np.isfinite(values).all() for values in arrays.values())
     assert (folder / "diverged.npz").exists()
+
+
+def test_torn_fiber_that_may_meet_others(meeting: Meeting) -> None:
+    """A fiber too soft for the flow is told as torn at twice its length, as without contact."""
+    kind = Kind(2, 6.0, modulus=2.0)
+    flow = {"kind": "planar_extension", "extension_rate": 1.0, "viscosity": 1.0}
+    fibers = [straight_fiber(kind, (1, 0, 0), (0, y, 0)) for y in (-4, 4)]
+    box = {"size": [200.0] * 3}
+    sim = meeting(
+        "overdamped",
+        2,
+        kinds=[kind],
+        flow=flow,
+        box=box,
+        placement=place([nodes + 100.0 for nodes in fibers], [0, 0]),
+    )
+    with pytest.raises(Diverged, match=r"fiber \d is torn at node"):
+        sim.step(100)
+    assert sim.method._segment_stretch().max() < 2.2

@@ -78,7 +78,7 @@ class Overdamped(Implicit):
         model, state, p = self.model, self.state, self.model.precision
         inputs = [
             stages,
-            1 if self.keeps else 0,
+            (2 if self.adaptive else 1) if self.keeps else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,

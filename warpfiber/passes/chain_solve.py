@@ -44,7 +44,8 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
     `loaded`: nodes have a force or, as `node_hold` says, a velocity in `node_load`, and frozen
     fibers are left to `carry_fibers`; `sheared`: stored images move with the flow.
 
-    `keeps`: steps may be rejected, so the state of the start is kept and a tear left to the error.
+    `keeps`: steps may be rejected, so the state of the start is kept (1, 2); a tear is left to the
+    error (2).
     `row_stride`: rows per fiber in `rows`; negative if all fibers of a launch share the first's.
     """
     p = precision(name)
@@ -388,7 +389,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                     error = wp.sqrt(furthest) / (real(segments) * g.rest)
                     if not (longest < tear * tear * g.rest * g.rest):
                         error = endless
-                        if keeps == 0:
+                        if keeps < 2:
                             status[wp.static(TORN)] = 1
                             status[wp.static(BAD_FIBER)] = fiber
                     fiber_error[fiber] = error
