@@ -25,12 +25,15 @@ from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
-from warpfiber.scene import Scene
+from warpfiber.scene import Fault, Scene, SceneError
 
 # Radii: a row with a larger predicted gap is not made. Less halves more steps of soft fibers, with
 # 0.5 a cell of rods has a fifth more rows.
 KEEP = 0.3
 OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
+# Parts of the first step that no list lasts, below which a step is not worth taking: with a given
+# skin, and with skins that grow as far as the box allows.
+SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
 FINITE = 1e20  # radii; penalties may overlap
 Launches = list[Launch | Call | Repeat]
 
@@ -133,6 +136,7 @@ class ImplicitContact:
             lattice_now=step.ends_lattice[1:2],
             fiber_frozen=fiber_frozen,
         )
+        self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)
 
     # -- the step ---------------------------------------------------------------------------------
@@ -176,8 +180,23 @@ class ImplicitContact:
             self.state.status.assign(words)
             return True
         if not self.search.use_up(step, self.check.list_use.numpy()[0]):
-            self.step.step_size.assign(0.5 * self.step.step_size.numpy())
+            self._halve()
         return self.search.refresh(step)
+
+    def _halve(self) -> None:
+        """Half the step, as no list lasts the whole; raises SceneError if none is worth taking."""
+        size, rejected = self.step.step_size.numpy(), self.step.rejected.numpy()
+        skin, box = self.scene.numerics.skin, self.scene.box
+        share = SHORTEST if skin is None else SHORTEST_GIVEN
+        self.shortest = self.shortest or share * float(size[0])
+        if size[0] < self.shortest:
+            remedy = "too small: fibers leave the neighbor list within any step; enlarge it"
+            fault = Fault(self.scene.path, "box.size", list(box.size) if box else None, remedy)
+            if skin is not None:
+                fault = Fault(self.scene.path, "numerics.skin", skin, remedy)
+            raise SceneError([fault])
+        self.step.step_size.assign(0.5 * size)
+        self.step.rejected.assign(rejected + np.asarray([0, 1], dtype=rejected.dtype))
 
     # -- what is saved and told -------------------------------------------------------------------
 
