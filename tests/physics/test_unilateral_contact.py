@@ -40,7 +40,7 @@ from tests.reference import unilateral as un
 from tests.reference.bead_chain import Array, shear_gradient
 from tests.reference.overdamped_step import CHI, step_sdirk2
 from tests.row_cell import RowCell
-from warpfiber.passes.contact_rows import KEEP
+from warpfiber.methods.contact import KEEP
 from warpfiber.simulation import Simulation
 
 SOLVED = 1e-9
