@@ -12,6 +12,7 @@ Limits: nothing may be launched from another thread during a capture (Warp's rec
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ import warp as wp
 
 from warpfiber.passes.workers import Loop, Phase, Workers, wait_kernel
 
+COMPILERS = min(os.cpu_count() or 1, 4)  # at a time; each takes some hundred MB
 BATCH = 16  # steps per graph where looking after every step would cost more than it saves
 BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
 
@@ -30,7 +32,8 @@ def load_kernels(kernels: Iterable[Any], device: str) -> None:
     modules = list(dict.fromkeys(kernel.module for kernel in kernels))
     target = wp.get_device(device)
     if modules:
-        wp.force_load(target, modules=modules, block_dim=1 if target.is_cpu else 256)
+        block = 1 if target.is_cpu else 256
+        wp.force_load(target, modules=modules, block_dim=block, max_workers=COMPILERS)
 
 
 @dataclass
