@@ -42,6 +42,8 @@ _MEANINGS: dict[str, tuple[str, str]] = {
     "pressure_low": ("Pa", "pressure on the lower wall"),
     "pressure_high": ("Pa", "pressure on the upper wall"),
     "wall_work": ("J", "work of moving walls"),
+    "normal_difference_1": ("Pa", "N_1 = stress_11 - stress_33"),
+    "normal_difference_2": ("Pa", "N_2 = stress_33 - stress_22"),
     "relative_viscosity": ("", "1 + stress of the fibers over that of the fluid, by dissipation"),
 }
 _PATTERNS: tuple[tuple[str, str, str], ...] = (
