@@ -57,6 +57,15 @@ class MovingResponse(Response, Protocol):
         """`carried`: share of the velocity of contact that the fibers take on."""
 
 
+class StepLoad(Protocol):
+    """Forces of contact that stay on the fibers in the motion without contact."""
+
+    node_foreseen: Any  # (N,) vec3 where the step ends if they stay as they are
+
+    def note(self, again: bool) -> Launch:
+        """After a solve; `again`: its forces come on top of those of the one before."""
+
+
 def has_contact(scene: Scene) -> bool:
     """Whether fibers meet one another or a wall."""
     return scene.contact.law != "none" or scene.contact.lubrication != "none"
@@ -90,10 +99,11 @@ class ImplicitContact:
         stretch: float,
         workers: int,
         response: MovingResponse,
+        load: StepLoad | None = None,
         fiber_frozen: Any = None,
     ) -> None:
         self.scene, self.model, self.state, self.step = scene, model, state, step
-        self.response, self.flow_origin = response, flow_origin
+        self.response, self.load, self.flow_origin = response, load, flow_origin
         self.hard = scene.numerics.contact == "unilateral"
         radii = [row["radius"] for row in model.group_rows]
         reach = 2.0 * max(radii) + KEEP * min(radii)
@@ -111,6 +121,7 @@ class ImplicitContact:
                 lattice_back=lattice[1:2] if again else lattice[0:1],
                 lattice_now=lattice[1:2],
                 step_size=step.step_size,
+                node_foreseen=load.node_foreseen if load is not None and not again else None,
                 keep=KEEP,
                 lubrication="none" if again else scene.contact.lubrication,
             )
@@ -148,13 +159,11 @@ class ImplicitContact:
     def launches(self) -> Launches:
         """From the motion without contact to the verdict on the step."""
         state, step, verdict = self.state, self.step, self.check.kernels
-        found: Launches = [
-            *self.check.list_launches(state.node_pos, step.deformation_next, self.flow_origin)
-        ]
-        gate = [self.check.list_short, state.status, step.rejected]
-        found.append(Launch("gate", verdict["gate_list"], 1, gate))
-        for rows, dual in self.solves:
+        found = self._listed(state.node_pos if self.load is None else self.load.node_foreseen)
+        for again, (rows, dual) in enumerate(self.solves):
             found += [*rows.launches(), *dual.launches(), self.response.apply(dual, carried=1.0)]
+            if self.load is not None:
+                found.append(self.load.note(again > 0))
         needs = [rows.row_need for rows, _ in self.solves]
         judge = [
             wp.float64(OVERLAP if self.hard else FINITE),
@@ -166,10 +175,19 @@ class ImplicitContact:
             state.status,
             step.verdict,
         ]
+        found += self.check.launches()
+        found.append(Launch("verdict", verdict["judge_contacts"], 1, judge))
+        if self.load is not None:  # fibers that others bend may end elsewhere than was foreseen
+            found += self._listed(state.node_pos)
+        return found
+
+    def _listed(self, node_pos: Any) -> Launches:
+        """Whether the list holds for these ends of the step; without it there is no step."""
+        check, step = self.check, self.step
+        gate = [check.list_short, self.state.status, step.rejected]
         return [
-            *found,
-            *self.check.launches(),
-            Launch("verdict", verdict["judge_contacts"], 1, judge),
+            *check.list_launches(node_pos, step.deformation_next, self.flow_origin),
+            Launch("gate", check.kernels["gate_list"], 1, gate),
         ]
 
     def settle(self, step: int) -> bool:

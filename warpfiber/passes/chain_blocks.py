@@ -16,6 +16,7 @@ from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push, mak
 from warpfiber.passes.chain_solve import OPTIONS
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
 from warpfiber.passes.elimination import elimination_row
+from warpfiber.passes.native import LANES
 from warpfiber.passes.native_blocks import MOST_NODES, make_native_blocks
 from warpfiber.passes.precision import group_struct
 
@@ -89,6 +90,7 @@ def make_end_kernels(name: str, lanes: int = 1):
         end_known: wp.array(dtype=wp.uint8),
         end_force: wp.array(dtype=real),
         end_move: wp.array(dtype=real),
+        end_diagonal: wp.array(dtype=real),
     ):
         fiber = wp.tid() + offset
         begin = end_start[fiber]
@@ -102,6 +104,7 @@ def make_end_kernels(name: str, lanes: int = 1):
             end_known[e] = wp.uint8(0)
             end_force[e] = real(0.0)
             end_move[e] = real(0.0)
+            end_diagonal[e] = real(0.0)
             if e - begin < owned:
                 end_row[e] = own
                 row_end[2 * own] = e
@@ -129,6 +132,7 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
     chain_reply = make_chain_reply(name)
     reply_numbers = make_reply_numbers(name)
     fill_block, move_ends = make_native_blocks(name)
+    lanes = LANES[name]
     gather_push = make_gather_push(name)
     zero, one = real(0.0), real(1.0)
 
@@ -171,6 +175,7 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
         end_known: wp.array(dtype=wp.uint8),
         end_force: wp.array(dtype=real),
         end_move: wp.array(dtype=real),
+        end_diagonal: wp.array(dtype=real),
     ):
         if control[wp.static(NEXT_PHASE)] == wp.static(DONE):
             return
@@ -264,6 +269,10 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
                     end_row,
                     block,
                 )
+                width = (end - begin + wp.static(lanes - 1)) / wp.static(lanes) * wp.static(lanes)
+                for e in range(begin, end):
+                    if end_force[e] != zero:
+                        end_diagonal[e] = block[column + (e - begin) * (width + 1)]
             move_ends(begin, end, column, block, end_force, end_move)
             return
         for e in range(begin, end):
@@ -309,6 +318,7 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
                             fraction = row_t[r]
                             normal = row_normal[r]
                         block[column + e - begin] = end_motion(node, fraction, normal, node_shift)
+                    end_diagonal[source] = block[column + source - begin]
                 for e in range(begin, end):
                     end_move[e] = end_move[e] + force * block[column + e - begin]
             column += end - begin

@@ -181,6 +181,7 @@ class ChainResponse:
         self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
         self.end_known = self._array(ends, wp.uint8)
         self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
+        self.end_diagonal = self._array(ends, real)
         self.block = self._array(self.block_share * ends, real)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
@@ -204,6 +205,7 @@ class ChainResponse:
             self.end_known,
             self.end_force,
             self.end_move,
+            self.end_diagonal,
         ]
         return [
             Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
@@ -250,6 +252,7 @@ class ChainResponse:
             self.end_known,
             self.end_force,
             self.end_move,
+            self.end_diagonal,
         ]
         kernel = make_chain_moves(model.precision.name, dual.has_frozen, self.native)
         return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
@@ -282,5 +285,5 @@ class ChainResponse:
 
 def chain_response_bytes(nodes: int, segments: int, rows: int, real: int) -> int:
     """Bytes of the arrays of `ChainResponse`, for reals of `real` bytes."""
-    per_row = 2 * (8 + 1 + (2 + BLOCK_SHARE) * real)
+    per_row = 2 * (8 + 1 + (3 + BLOCK_SHARE) * real)
     return nodes * 7 * real + segments * real + rows * per_row

@@ -33,7 +33,8 @@ class ContactRows:
     Rows (capacity): `row_i`, `row_j`, `row_s`, `row_t`, `row_normal`, `row_base`,
     `row_compliance`, `row_force`; those of segment i are `row_out_start[i:i+2]`, those of listed
     pair k the `pair_row_count[k]` from `pair_row[k]` on; `row_count` (1) in all, `row_need` (1) is
-    0 unless they do not fit.
+    0 unless they do not fit. `node_foreseen`: where the step is thought to end, which decides on
+    the rows that are made; where it would end without them unless given.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class ContactRows:
         lattice_back: Any,
         lattice_now: Any,
         step_size: Any,
+        node_foreseen: Any = None,
         keep: float = KEEP,
         lubrication: str = "none",
         capacity: int | None = None,
@@ -53,6 +55,7 @@ class ContactRows:
         self.model, self.state, self.pairs = model, state, pairs
         self.node_back, self.step_size = node_back, step_size
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
+        self.node_foreseen = state.node_pos if node_foreseen is None else node_foreseen
         self.keep = keep
         domain = model.domain
         self.features = RowFeatures(any(domain.periodic), domain.wall, lubrication)
@@ -173,7 +176,7 @@ class ContactRows:
         ]
 
     def _count_inputs(self) -> list[Any]:
-        real, state = self.model.precision.real, self.state
+        real = self.model.precision.real
         widest = max(row["radius"] for row in self.model.group_rows)
         return [
             real(self.keep),
@@ -181,8 +184,8 @@ class ContactRows:
             *self._walls(),
             *self._fibers(),
             self.node_back,
-            state.node_pos,
-            state.status,
+            self.node_foreseen,
+            self.state.status,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,
@@ -197,6 +200,7 @@ class ContactRows:
             state.fiber_image,
             self.node_back,
             state.node_pos,
+            self.node_foreseen,
             self.step_size,
             self.carried_start,
             self.carried_j,

@@ -117,8 +117,10 @@ MOVE_ENDS = """
     const T* const columns = block.data + column;
     for (int group = 0; group < count; group += W) {
         V move = V(T(0));
-        for (int e = 0; e < count; ++e)
-            move += end_force.data[begin + e] * *(const U*)(columns + (long)e * width + group);
+        for (int e = 0; e < count; ++e) {
+            const T force = end_force.data[begin + e];
+            if (force != T(0)) move += force * *(const U*)(columns + (long)e * width + group);
+        }
         for (int l = 0; l < W && group + l < count; ++l)
             end_move.data[begin + group + l] = move[l];
     }

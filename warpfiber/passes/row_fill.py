@@ -88,6 +88,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
         fiber_image: wp.array(dtype=wp.vec3i),
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        node_foreseen: wp.array(dtype=vec3),
         step_size: wp.array(dtype=wp.float64),
         carried_start: wp.array(dtype=wp.int32),
         carried_j: wp.array(dtype=wp.int32),
@@ -212,9 +213,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                 for axis in range(3):
                     if has_wall(axis):
                         for side in range(2):
-                            gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
-                            gap -= gi.radius
-                            if gap < keep * gi.radius:
+                            gap = wall_gap(node_foreseen[node], axis, side, wall_low, wall_high)
+                            if gap - gi.radius < keep * gi.radius:
+                                gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
                                 normal = vec3(zero, zero, zero)
                                 normal[axis] = real(2 * side - 1)
                                 key = 4 * axis + 2 * side + (node - node_i)
@@ -224,7 +225,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 row_s_out[r] = real(node - node_i)
                                 row_t_out[r] = zero
                                 row_normal_out[r] = normal
-                                row_base_out[r] = gap
+                                row_base_out[r] = gap - gi.radius
                                 row_compliance_out[r] = zero
                                 row_force_out[r] = carried_row_force(
                                     wp.static(WALL),
