@@ -27,14 +27,12 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
     Row("stage", "control", ("displacement",), 'use control = "displacement" and end_pressure'),
     Row("stage", "pressure_rate", (), "remove it; the wall moves at speed"),
-    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
                                  "curvature", "stress"),
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
-    Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
 
@@ -63,6 +61,7 @@ FLOWING = (
         ),
         "remove it from the list; it is of method bonded_spheres",
     ),
+    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
 )

@@ -29,7 +29,8 @@ def pressed_axis(scene: Scene) -> int:
         if stage.kind in PRESSING and stage.wall is not None:
             return WALL_NAMES.index(stage.wall) // 2
     walls = [] if scene.box is None else [k for k in range(3) if scene.box.boundary[k] == "wall"]
-    return walls[-1] if walls and "stress" in scene.record.quantities else -1
+    metered = "stress" in scene.record.quantities or any(stage.save for stage in scene.stages)
+    return walls[-1] if walls and metered else -1
 
 
 def passing_time(draft: Draft, stage: Values) -> float | None:

@@ -34,13 +34,14 @@ ROUNDING = 1e-9
 def resolve(draft: Draft) -> None:
     """Complete all tables of the draft; faults go to its list."""
     _resolve_flow(draft)
-    for index, group in enumerate(draft.fibers):
+    for index, group in enumerate(draft.fibers if draft.saved is None else ()):
         resolve_lengths(draft, group, f"fibers.{index}")
         resolve_layers(draft, group, f"fibers.{index}")
         _resolve_length(draft, group, f"fibers.{index}")
         _resolve_group(draft, group, f"fibers.{index}")
         _resolve_count(draft, group, f"fibers.{index}")
-    _resolve_segments(draft)
+    if draft.saved is None:
+        _resolve_segments(draft)
     _resolve_contact(draft)
     _resolve_stages(draft)
     record = draft.record
