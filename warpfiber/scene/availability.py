@@ -25,8 +25,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
-    Row("stage", "control", ("displacement",), 'use control = "displacement" and end_pressure'),
-    Row("stage", "pressure_rate", (), "remove it; the wall moves at speed"),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
                                  "curvature", "stress"),

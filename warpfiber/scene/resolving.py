@@ -13,7 +13,7 @@ from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, strain_time
 from warpfiber.scene.keys import Values
-from warpfiber.scene.pressing import PRESSING, passing_time
+from warpfiber.scene.pressing import PRESSING, loading_time, passing_time
 from warpfiber.scene.statistics import resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
@@ -266,7 +266,8 @@ def _resolve_stages(draft: Draft) -> None:
             stage["name"] = stage["kind"]
         ended = any(draft.is_given(f"stage.{index}.{key}") for key in ("end_strain", "end_time"))
         if stage["time_limit"] is None and not ended:
-            stage["time_limit"] = passing_time(draft, stage) or 100.0
+            longest = loading_time if stage["control"] == "load" else passing_time
+            stage["time_limit"] = longest(draft, stage) or 100.0
         if stage["kind"] in PRESSING and stage["control"] is None:
             stage["control"] = "displacement"
         seconds = strain_time(stage)
