@@ -37,28 +37,14 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
 STRAIGHT = Row("shape", "kind", ("straight",),
                'fibers of this method are straight at rest; use kind = "straight", '
                "or node_file to start from another form")  # fmt: skip
+IN_FLOW = ("orientation", "orientation4", "contacts", "overlap", "interactions", "axial_strain",
+           "energy", "rotation", "curvature")  # fmt: skip
 FLOWING = (
     STRAIGHT,
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_volume_fraction", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_pressure", (), "end the stage by end_strain or end_time"),
-    Row(
-        "record",
-        "quantities",
-        (
-            "orientation",
-            "orientation4",
-            "contacts",
-            "overlap",
-            "interactions",
-            "axial_strain",
-            "energy",
-            "rotation",
-            "curvature",
-        ),
-        "remove it from the list; it is of method bonded_spheres",
-    ),
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
@@ -75,15 +61,20 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
             'use law = "exponential", or method = "overdamped"'),
         Row("numerics", "contact", ("penalty",),
             'use contact = "penalty", or method = "overdamped"'),
+        Row("record", "quantities", IN_FLOW, 'remove it, or use method = "overdamped" for stress'),
     ),
     "overdamped": (
         *FLOWING,
         SOFT,
+        Row("record", "quantities", (*IN_FLOW, "stress"),
+            "remove it from the list; it is of method bonded_spheres"),
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
         *FLOWING,
         SOFT,
+        Row("record", "quantities", (*IN_FLOW, "stress"),
+            "remove it from the list; it is of method bonded_spheres"),
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (

@@ -325,6 +325,10 @@ def _check_rest(draft: Draft) -> None:
 
 
 def _check_record(draft: Draft) -> None:
-    """Layers are slices of a box."""
-    if draft.record["layers"] and draft.box is None and draft.start is None:
+    """Layers are slices of a box, and stress is force over its faces."""
+    if draft.box is not None or draft.start is not None:
+        return
+    if draft.record["layers"]:
         draft.blame("record.layers", "layers are slices of a box; add [box], or remove it")
+    if "stress" in (draft.record["quantities"] or ()) and draft.method in INERTIALESS:
+        draft.blame("record.quantities", "stress is that of a box; add [box], or remove stress")
