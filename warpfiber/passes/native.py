@@ -10,12 +10,12 @@ PREFETCH_NODES = 100_000  # from so many nodes on they do not stay in a cache
 LANES = {"float32": 16, "float64": 8}  # 64 bytes
 
 
-def lane_types(name: str) -> str:
+def lane_types(name: str, lanes: int | None = None) -> str:
     """Real T, vector V of W lanes, U the same at any address, mask M, vector triple V3."""
     real = {"float32": "float", "float64": "double"}[precision(name).name]
     return f"""
     using T = {real};
-    constexpr int W = {LANES[name]};
+    constexpr int W = {lanes or LANES[name]};
     typedef T V __attribute__((ext_vector_type(W)));
     typedef T U __attribute__((ext_vector_type(W), aligned(sizeof(T))));
     typedef decltype(V() < V()) M;
@@ -34,7 +34,7 @@ def lane_types(name: str) -> str:
 """
 
 
-def transpose(lanes: int, rows: str = "r") -> str:
+def transpose(lanes: int, rows: str = "r", kind: str = "V") -> str:
     """Statements that transpose the square `rows[lanes]` of vectors in place, log2(lanes) stages.
 
     A stage with distance h swaps the off-diagonal h x h parts of every 2h x 2h part.
@@ -49,7 +49,7 @@ def transpose(lanes: int, rows: str = "r") -> str:
             high = [n + distance if not n & distance else lanes + n for n in range(lanes)]
             a, b = f"{rows}[{i}]", f"{rows}[{i + distance}]"
             lines.append(
-                f"{{ V a = {a}, b = {b};"
+                f"{{ {kind} a = {a}, b = {b};"
                 f" {a} = __builtin_shufflevector(a, b, {', '.join(map(str, low))});"
                 f" {b} = __builtin_shufflevector(a, b, {', '.join(map(str, high))}); }}"
             )
