@@ -32,17 +32,14 @@ from warpfiber.laws.contact_compliance import LAWS
 from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import make_measure_bonds
 from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
-from warpfiber.passes.capsule_pairs import (
-    CapsuleFeatures,
-    make_capsule_pairs,
-    make_carry_memory,
-)
+from warpfiber.passes.capsule_pairs import CapsuleFeatures, make_capsule_pairs
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
 from warpfiber.passes.chain_response import make_chain_apply, make_chain_response
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.contact_memory import make_carry_memory
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists

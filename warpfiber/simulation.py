@@ -21,10 +21,12 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
+from warpfiber.passes.layer_profile import LayerProfile
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import Fault, Scene, SceneError, Stage
+from warpfiber.scene.derived import group_volume
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
 
@@ -152,13 +154,23 @@ class Simulation:
             self.method.decay,
             self.method.inertia,
         )
+        self.layers: LayerProfile | None = None
+        if self.scene.record.layers:
+            self.layers = LayerProfile(
+                self.model,
+                self.state,
+                self.scene.record.layers,
+                [group_volume(self.scene, group) for group in self.scene.fibers],
+                "orientation4" in self.scene.record.quantities,
+            )
         self.begin_stage(self.scene.stage_sequence[0])
 
     # -- stepping ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Compile everything that the run needs and build the first list."""
-        self.method.prepare(self.measurement.kernels(self.method.list))
+        layers = [self.layers.kernel] if self.layers is not None else []
+        self.method.prepare([*self.measurement.kernels(self.method.list), *layers])
 
     def step(self, count: int = 1) -> None:
         """Advance `count` steps of dt.
@@ -318,6 +330,13 @@ class Simulation:
         self.prepare()
         row = {"step": self.step_count, "time": self.time, "strain": self.strain}
         return row | self.measurement.row(self.method.list) | self.method.measure()
+
+    def measure_layers(self) -> dict[str, np.ndarray]:
+        """What each of `record.layers` holds, SI: z_low, z_high and the columns of LayerProfile."""
+        if self.layers is None:
+            return {}
+        edges = self.layers.edges()
+        return {"z_low": edges[:-1], "z_high": edges[1:]} | self.layers.measure()
 
     # -- saving -----------------------------------------------------------------------------------
 

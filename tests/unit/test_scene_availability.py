@@ -64,7 +64,6 @@ NOT_YET: list[tuple[dict[str, object], str]] = [
     ({"stage.0.save": True}, "stage.0.save"),
     ({"stage.0.kind": "settle"}, "stage.0.kind"),
     ({"record.quantities": ["inclination"]}, "record.quantities"),
-    ({"record.layers": 5}, "record.layers"),
 ]
 
 

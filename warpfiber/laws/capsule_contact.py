@@ -27,7 +27,7 @@ SMALLEST_SINE = 0.02
 
 @cache
 def make_capsule_contact(name):
-    """`hertz_factor`, `curvatures`, `side_by_side` and `line_overlap`."""
+    """`curvatures`, `hertz_factor`, `side_by_side`, `line_overlap` and `line_depth`."""
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
@@ -120,4 +120,14 @@ def make_capsule_contact(name):
         center = wp.clamp(moment / wp.max(integral, tiny), u0, u1)
         return vec4(integral, center, w1, depth)
 
-    return curvatures, hertz_factor, side_by_side, line_overlap
+    @wp.func
+    def line_depth(d0: vec3, d1: vec3, reach: real) -> real:
+        """Deepest overlap along a and as far again beyond it at both ends.
+
+        The same for neighbors that share a patch, whatever part of it is theirs.
+        """
+        dv = d1 - d0
+        u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), -one, two)
+        return reach - wp.length(d0 + u * dv)
+
+    return curvatures, hertz_factor, side_by_side, line_overlap, line_depth

@@ -83,12 +83,13 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         state.node_pos,
         state.node_velocity,
         spheres.node_spin,
+        state.step,
         contacts.acts,
         contacts.force,
         contacts.moment,
         contacts.arms,
         contacts.memory,
-        contacts.stiffness,
+        contacts.written,
         state.status,
     ]
     kernel = make_capsule_pairs(p.name, contacts.features)
@@ -123,7 +124,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         spheres.node_load,
         *gathered,
         spheres.wall_memory,
-        spheres.wall_stiffness,
+        spheres.wall_depth,
         spheres.place,
         state.node_pos,
         state.node_velocity,

@@ -53,7 +53,7 @@ STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
     "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place "
-    "wall_memory wall_stiffness"
+    "wall_memory wall_depth"
 ).split()
 
 
@@ -97,7 +97,7 @@ class BondedSpheres(Method):
         self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
         kept = SIDES * nodes if self.features.wall_friction else 0
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
-        self.wall_stiffness = wp.zeros(kept, dtype=p.real, device=device)
+        self.wall_depth = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
         self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
         # float64 in every precision: world positions in float32 lose slow motion

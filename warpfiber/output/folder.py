@@ -1,8 +1,9 @@
 """ResultFolder: the folder of one run and its small text files.
 
-It holds `scene.json`, `log.txt`, `scalars.csv`, `summary.json`, `run.vtkhdf`,
-`checkpoint_<step>.h5`, `figures/` and `usd/`. A run never overwrites a folder unless it is told to,
-and even then it removes only what a run writes.
+It holds `scene.json`, `log.txt`, `scalars.csv`, `layers.csv`, `columns.csv` (what the columns of
+both are), `placement.csv`, `summary.json`, `run.vtkhdf`, `checkpoint_<step>.h5`, `figures/` and
+`usd/`. A run never overwrites a folder unless it is told to, and even then it removes only what a
+run writes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,17 @@ from warpfiber.scene import Fault, SceneError
 
 __all__ = ["RecordError", "ResultFolder", "describe"]
 
-_FILES = ("scene.json", "log.txt", "scalars.csv", "summary.json", "run.vtkhdf", "diverged.npz")
+_FILES = (
+    "scene.json",
+    "log.txt",
+    "scalars.csv",
+    "layers.csv",
+    "columns.csv",
+    "placement.csv",
+    "summary.json",
+    "run.vtkhdf",
+    "diverged.npz",
+)
 _FOLDERS = ("figures", "usd")
 
 
@@ -98,6 +109,11 @@ class ResultFolder:
     def scalars_path(self) -> Path:
         """The table of measured numbers, `scalars.csv`."""
         return self.path / "scalars.csv"
+
+    @property
+    def layers_path(self) -> Path:
+        """What the layers of the box held at every frame, `layers.csv`."""
+        return self.path / "layers.csv"
 
     def write_scene(self, scene: Mapping[str, Any]) -> None:
         """Write the resolved scene as `scene.json`."""

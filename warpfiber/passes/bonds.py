@@ -120,7 +120,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
         wall_memory: wp.array(dtype=vec3),
-        wall_stiffness: wp.array(dtype=real),
+        wall_depth: wp.array(dtype=real),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -225,7 +225,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     wall_place,
                     wall_velocity,
                     wall_memory,
-                    wall_stiffness,
+                    wall_depth,
                 )
                 force += push
                 moment += couple

@@ -33,7 +33,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
                                  "curvature", "stress"),
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
-    Row("record", "layers", (0,), "remove it; quantities are of the whole cell"),
     Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
     Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip

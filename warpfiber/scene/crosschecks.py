@@ -44,6 +44,7 @@ def cross_check(draft: Draft) -> None:
     _check_contact(draft)
     _check_stages(draft)
     _check_rest(draft)
+    _check_record(draft)
     check_loads(draft)
     check_pressing(draft)
 
@@ -319,3 +320,9 @@ def _check_rest(draft: Draft) -> None:
             draft.blame(f"stage.{index}.end_strain", "the fluid rests; end the stage by end_time")
     if draft.record["every_strain"] is not None:
         draft.blame("record.every_strain", "the fluid rests; use every_time or frames")
+
+
+def _check_record(draft: Draft) -> None:
+    """Layers are slices of a box."""
+    if draft.record["layers"] and draft.box is None and draft.start is None:
+        draft.blame("record.layers", "layers are slices of a box; add [box], or remove it")

@@ -289,7 +289,7 @@ RECORD = Table(
             default=("orientation", "contacts", "overlap"),
         ),
         Key("node_fields", ListOf(Choice(NODE_FIELDS), unique=True), default=()),
-        Key("layers", Number(least=0, whole=True), default=0),
+        Key("layers", Number(least=0, below=1001, whole=True), default=0),
         Key("trajectory", Switch(), default=True),
         Key("usd", Switch(), default=False),
         Key("figures", Switch(), default=True),
