@@ -139,7 +139,7 @@ def step_times(simulation: wf.Simulation, steps: int, repeats: int) -> dict[str,
         "ns_list": round(float(np.mean(lists)), 1),
         "steps_per_build": round(repeats * steps / max(1, builds), 1),
         "ns_by_pass": {name: round(s * 1e9 / nodes, 2) for name, s in passes.items()},
-        "vectorized": getattr(method,"native",False),
+        "vectorized": method.native is not None,
         "list": after,
         **found,
     }

@@ -55,3 +55,37 @@ def transpose(lanes: int, rows: str = "r", kind: str = "V") -> str:
             )
         distance *= 2
     return "\n".join(lines)
+
+
+# Between arrays of c numbers per node, fibers anywhere, and c vectors per node: squares of W
+# numbers of W fibers. The last square of a fiber overlaps the one before.
+def transfers(kind: str, lanes: int) -> str:
+    """`load_V` and `store_V` of vectors of this kind, for the `first` nodes of `own` fibers."""
+    turn = transpose(lanes, kind=kind)
+    return f"""
+    auto load_{kind} = [&](int c, {kind}* to, const auto* from) __attribute__((noinline)) {{
+        const int size = c * nodes;
+        for (int next = 0; next < size; next += W) {{
+            const int at = next < size - W ? next : size - W;
+            {kind} r[W];
+            #pragma unroll
+            for (int l = 0; l < W; ++l)
+                __builtin_memcpy(&r[l], from + (long)c * first[l] + at, sizeof({kind}));
+            {turn}
+            #pragma unroll
+            for (int l = 0; l < W; ++l) to[at + l] = r[l];
+        }}
+    }};
+    auto store_{kind} = [&](int c, auto* to, const {kind}* from) __attribute__((noinline)) {{
+        const int size = c * nodes;
+        for (int next = 0; next < size; next += W) {{
+            const int at = next < size - W ? next : size - W;
+            {kind} r[W];
+            #pragma unroll
+            for (int l = 0; l < W; ++l) r[l] = from[at + l];
+            {turn}
+            for (int l = 0; l < own; ++l)
+                __builtin_memcpy(to + (long)c * first[l] + at, &r[l], sizeof({kind}));
+        }}
+    }};
+"""

@@ -107,7 +107,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         i: wp.int32,
         x: wp.vec3d,
         wall_place: wp.array(dtype=wp.vec3d),
-        wall_stiffness: wp.array(dtype=real),
+        wall_depth: wp.array(dtype=real),
     ) -> wp.bool:
         """Whether a node touches a wall or has just ceased to."""
         reach = wp.float64(g.radius)
@@ -122,7 +122,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     return True
                 if wp.static(has_friction):
                     slot = wp.static(SIDES) * i + 2 * axis
-                    if wall_stiffness[slot] != zero or wall_stiffness[slot + 1] != zero:
+                    if wall_depth[slot] != zero or wall_depth[slot + 1] != zero:
                         return True
         return False
 
@@ -137,7 +137,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         wall_damping: real,
         wall_friction: real,
         wall_memory: wp.array(dtype=vec3),
-        wall_stiffness: wp.array(dtype=real),
+        wall_depth: wp.array(dtype=real),
         list_sizes: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
@@ -187,7 +187,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     last = fiber_node_start[fiber + 1] - 1
                     pushed = wp.vec2d()
                     for i in range(first, last + 1):
-                        touches = is_at_wall(g, i, place[i], wall_place, wall_stiffness)
+                        touches = is_at_wall(g, i, place[i], wall_place, wall_depth)
                         node_touches[i] = wp.uint8(touches)
                         if not touches:
                             continue
@@ -209,7 +209,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                             wall_place,
                             wall_velocity,
                             wall_memory,
-                            wall_stiffness,
+                            wall_depth,
                         )
                         node_push[i] = push
                         node_couple[i] = couple

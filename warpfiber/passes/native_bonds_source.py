@@ -1,8 +1,7 @@
 """C++ text of the SIMD sweep over bonded spheres: what one block of fibers does (`native_bonds`).
 
-The laws of `bond` and `rotation`, one lane per fiber. The factor g of a bond is the short series of
-`bond` where that holds, and one of 24 terms up to half a turn between two nodes: no angle is left
-that needs trigonometry. Positions are float64 in every precision.
+The laws of `bond` (`native_bond_law`) and `rotation`, one lane per fiber. Positions are float64 in
+every precision.
 Symbols: as in `bond`; T real, V and P vectors of T and double; x, v, q, w, a, b scratch of
     positions, velocities, quaternions, spins, loads (then accelerations) and moments, one vector
     per number of a node.
@@ -10,15 +9,13 @@ Symbols: as in `bond`; T real, V and P vectors of T and double; x, v, q, w, a, b
 
 import math
 
-from warpfiber.laws.bending import SERIES_END, SERIES_TERMS, bending_series
 from warpfiber.laws.rotation import LARGEST_HALF_ANGLE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, SETTLING, BondFeatures
-from warpfiber.passes.native import lane_types, transpose
+from warpfiber.passes.native import lane_types, transfers
+from warpfiber.passes.native_bond_law import BONDS, bond_constants
 
 LANES = 8  # fibers, in both precisions
-# Of the series up to a right angle between a node and the frame midway: errors 2e-17 and 3e-10.
-LONG_SERIES_TERMS = 24
 
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
@@ -33,20 +30,13 @@ def _constants(features: BondFeatures) -> str:
         "HAS_PAIRS": features.pairs,
     }
     lines = [f"constexpr bool {key} = {str(value).lower()};" for key, value in flags.items()]
-    short, long = (
-        bending_series(SERIES_END, SERIES_TERMS),
-        bending_series(1.0, LONG_SERIES_TERMS),
-    )
     tables = {
-        "SHORT": short,
-        "LONG": long,
         "COSINE": [(-1.0) ** n / math.factorial(2 * n) for n in range(6)],
         "SINE": [(-1.0) ** n / math.factorial(2 * n + 1) for n in range(6)],
     }
     for key, values in tables.items():
         text = ", ".join(f"T({float(value)!r})" for value in values)
         lines.append(f"constexpr T {key}[{len(values)}] = {{{text}}};")
-    lines.append(f"constexpr T SERIES_END = T({SERIES_END!r});")
     lines.append(f"constexpr T LARGEST = T({LARGEST_HALF_ANGLE**2!r});")
     slots = {
         "SLOT_EXPIRED": EXPIRED,
@@ -63,40 +53,6 @@ def _constants(features: BondFeatures) -> str:
     }
     lines += [f"constexpr int {key} = {value};" for key, value in slots.items()]
     return "\n".join(lines)
-
-
-# Between arrays of c numbers per node, fibers anywhere, and c vectors per node: squares of W
-# numbers of W fibers. The last square of a fiber overlaps the one before.
-def _transfer(kind: str) -> str:
-    """`load_V` and `store_V` of vectors of this kind."""
-    turn = transpose(LANES, kind=kind)
-    return f"""
-    auto load_{kind} = [&](int c, {kind}* to, const auto* from) __attribute__((noinline)) {{
-        const int size = c * nodes;
-        for (int next = 0; next < size; next += W) {{
-            const int at = next < size - W ? next : size - W;
-            {kind} r[W];
-            #pragma unroll
-            for (int l = 0; l < W; ++l)
-                __builtin_memcpy(&r[l], from + (long)c * first[l] + at, sizeof({kind}));
-            {turn}
-            #pragma unroll
-            for (int l = 0; l < W; ++l) to[at + l] = r[l];
-        }}
-    }};
-    auto store_{kind} = [&](int c, auto* to, const {kind}* from) __attribute__((noinline)) {{
-        const int size = c * nodes;
-        for (int next = 0; next < size; next += W) {{
-            const int at = next < size - W ? next : size - W;
-            {kind} r[W];
-            #pragma unroll
-            for (int l = 0; l < W; ++l) r[l] = from[at + l];
-            {turn}
-            for (int l = 0; l < own; ++l)
-                __builtin_memcpy(to + (long)c * first[l] + at, &r[l], sizeof({kind}));
-        }}
-    }};
-"""
 
 
 # Loads of pairs and walls, fiber by fiber: few nodes have any.
@@ -143,85 +99,7 @@ _GATHER = """
                     }
 """
 
-_BONDS = """
-    const V kn = V(g.stiffness[0]), kt = V(g.stiffness[1]);
-    const V kb = V(g.stiffness[2]), kw = V(g.stiffness[3]);
-    const V cn = V(g.dashpots[0]), ct = V(g.dashpots[1]);
-    const V cb = V(g.dashpots[2]), cw = V(g.dashpots[3]);
-    auto split = [](const V3& u, const V3& axis, V along, V across) -> V3 {
-        return u * across + axis * ((along - across) * u.dot(axis));
-    };
-    M torn = V(T(1)) < T(0);
-    const T torn2 = g.torn_length * g.torn_length;
-    P3 x0 = get_P(x, 0);
-    V3 v0 = get(v, 0), w0 = get(w, 0);
-    V4 q0 = get4(q, 0);
-    for (int k = 0; k < segments; ++k) {
-        const P3 x1 = get_P(x, k + 1);
-        const V3 v1 = get(v, k + 1), w1 = get(w, k + 1);
-        const V4 q1 = get4(q, k + 1);
-        const V3 d = {narrow(x1.x - x0.x), narrow(x1.y - x0.y), narrow(x1.z - x0.z)};
-        const V3 e0 = get(axis, k);
-        const V l0 = length[k];
-        V pw = q0.v.dot(q1.v) + q0.s * q1.s;
-        const V sign = pw < T(0) ? V(T(-1)) : V(T(1));
-        pw *= sign;
-        const V3 near_v = q1.v * sign;
-        const V near_s = q1.s * sign;
-        const V3 pv = near_v * q0.s - q0.v * near_s - q0.v.cross(near_v);
-        const V side = T(1) / (T(1) + pw);
-        const V3 s = q0.v + near_v;
-        const V ss = q0.s + near_s;
-        // rotation by the frame midway, of any length: |s|^2 = 2 (1 + p_w)
-        const V3 r = s * side;
-        const V xx = r.x * s.x, yy = r.y * s.y, zz = r.z * s.z;
-        const V xy = r.x * s.y, xz = r.x * s.z, yz = r.y * s.z;
-        const V sx = r.x * ss, sy = r.y * ss, sz = r.z * ss;
-        const V3 m0 = {T(1) - (yy + zz), xy - sz, xz + sy};
-        const V3 m1 = {xy + sz, T(1) - (xx + zz), yz - sx};
-        const V3 m2 = {xz - sy, yz + sx, T(1) - (xx + yy)};
-        const V3 edge = m0 * d.x + m1 * d.y + m2 * d.z;
-
-        const V y = T(1) - pw, z = y * y;
-        V even = SHORT[7] + z * (SHORT[9] + z * SHORT[11]);
-        even = SHORT[1] + z * (SHORT[3] + z * (SHORT[5] + z * even));
-        V odd = SHORT[6] + z * (SHORT[8] + z * SHORT[10]);
-        odd = SHORT[2] + z * (SHORT[4] + z * odd);
-        V slope = even + y * odd;
-        const M wide = y > SERIES_END;
-        if (__builtin_expect(any(wide), 0)) {
-            V sum = V(LONG[LONG_TERMS - 1]);
-            #pragma unroll
-            for (int t = LONG_TERMS - 2; t > 0; --t) sum = sum * y + LONG[t];
-            slope = wide ? sum : slope;
-        }
-        const V factor = T(1) + y * slope;
-
-        const V3 n = split(edge - e0 * l0, e0, kn, kt);
-        const V3 mm = split(pv * (factor * T(2)), e0, kw, kb);
-        V3 couple = mm * factor - pv * (slope * side * pv.dot(mm));
-        couple = couple + edge.cross(n).cross(pv) * (side * T(0.5));
-        V3 pull = {m0.dot(n), m1.dot(n), m2.dot(n)};
-        V3 twist = {m0.dot(couple), m1.dot(couple), m2.dot(couple)};
-        const V dd = d.dot(d);
-        if constexpr (HAS_DASHPOTS) {
-            const V inverse = T(1) / (dd > T(1e-30) ? dd : V(T(1e-30)));
-            const V3 slip = v1 - v0 - (w0 + w1).cross(d) * V(T(0.5));
-            const V3 turning = w1 - w0;
-            pull = pull + slip * ct + d * ((cn - ct) * inverse * slip.dot(d));
-            twist = twist + turning * cb + d * ((cw - cb) * inverse * turning.dot(d));
-        }
-        const V3 lever = d.cross(pull) * V(T(0.5));
-        put(a, k, get(a, k) + pull);
-        put(b, k, get(b, k) + lever + twist);
-        put(a, k + 1, get(a, k + 1) - pull);
-        put(b, k + 1, get(b, k + 1) + lever - twist);
-        torn |= ~(dd < torn2);  // not finite is torn too
-        x0 = x1;
-        v0 = v1;
-        w0 = w1;
-        q0 = q1;
-    }
+_RATES = """
     if (any(torn))
         for (int l = 0; l < own; ++l)
             if (torn[l]) {
@@ -400,21 +278,24 @@ _LOAD = """
 def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
-    work = _LOAD.replace("GATHER", _GATHER).replace("BONDS", _BONDS)
+    work = _LOAD.replace("GATHER", _GATHER).replace("BONDS", BONDS + _RATES)
     work += _MOVE.replace("HOLD", _HOLD) + _STORE
     types = lane_types(name, LANES)
+    places = "auto& load_P = load_V; auto& store_P = store_V;"
+    if name == "float32":
+        places = transfers("P", LANES)
     return f"""
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {types}
     typedef double P __attribute__((ext_vector_type(W)));
     constexpr bool IS_SINGLE = sizeof(T) == 4;
-    constexpr int LONG_TERMS = {LONG_SERIES_TERMS};
     {_constants(features)}
+    {bond_constants()}
     if (status[SLOT_HALT] != 0) return;
     {_SWEEP}
-    {_transfer("V")}
-    {_transfer("P") if name == "float32" else "auto& load_P = load_V; auto& store_P = store_V;"}
+    {transfers("V", LANES)}
+    {places}
     {work}
     }};
     sweep();
