@@ -35,6 +35,7 @@ def arrays(sim: Simulation) -> dict[str, Any]:
         "node_velocity": state.node_velocity,
         "status": state.status,
         "acts": method.contacts.acts,
+        "grip": method.grips.node_grip,
         "memory": method.contacts.memory,
         "written": method.contacts.written,
     }
@@ -62,6 +63,9 @@ def assert_near(sim: Simulation, found: Any, expected: Any, precision: str) -> N
         error = np.abs(found[name].astype(float) - expected[name]).max()
         scale = change if "place" not in name and "turn" not in name else np.abs(before[name]).max()
         assert error < BOUND[precision] * scale, name
+    assert np.abs(found["grip"] - expected["grip"]).max(initial=0.0) < BOUND[precision] * np.abs(
+        expected["grip"]
+    ).max(initial=1.0)
     for name in ("status", "still_steps"):
         np.testing.assert_array_equal(found[name], expected[name])
 
@@ -74,6 +78,17 @@ LOAD = [
 SCENES: dict[str, dict[str, Any]] = {
     "all": {},
     "loads": {"load": LOAD},
+    "grips": {
+        "stage": [
+            {
+                "kind": "shear",
+                "speed": 0.01,
+                "freeze_below": 0.004,
+                "freeze_above": 0.016,
+                "end_strain": 1.0,
+            }
+        ]
+    },
     "smooth": {"contact": {"friction": 0.0, "wall_friction": 0.0, "damping": 0.0}},
     "open": {
         "box": {"size": [0.06, 0.04, 0.02], "boundary": ["open"] * 3},
@@ -105,6 +120,7 @@ def test_same_as_plain(precision: str, turn: float, name: str) -> None:
     assert expected["acts"].any()
     found = after(sim, [first, pairs, native.launch(LOADS | END)])
     assert_near(sim, found, expected, precision)
+    assert (name == "grips") == bool(expected["grip"].any())
     if "wall" in str(sim.scene.box) and name != "smooth" and name != "open":
         assert expected["wall_depth"].any()
         np.testing.assert_array_equal(found["wall_memory"], expected["wall_memory"])

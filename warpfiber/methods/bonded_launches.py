@@ -125,8 +125,9 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         model.fiber_group,
         spheres.bond_axis,
         spheres.bond_length,
-        spheres.node_hold,
-        spheres.node_load,
+        spheres.holds.hold,
+        spheres.holds.load,
+        spheres.grips.node_grip,
         *gathered,
         spheres.wall_memory,
         spheres.wall_depth,
@@ -182,8 +183,9 @@ class NativeBonds:
             model.fiber_group,
             spheres.bond_axis,
             spheres.bond_length,
-            spheres.node_hold,
-            spheres.node_load,
+            spheres.holds.hold,
+            spheres.holds.load,
+            spheres.grips.node_grip,
             pairs.out_start,
             pairs.in_start,
             pairs.in_pair,
@@ -216,13 +218,15 @@ class NativeBonds:
         """What a step launches."""
         launches = [clock_launch(self.spheres), pair_launch(self.spheres, 0.0)]
         launches += [self.launch(0), *self.spheres.press.motion(), *self.spheres.press.meter()]
+        launches += self.spheres.grips.meter()
         return [launch.kernel for launch in launches]
 
     def steps(self, halted: Callable[[], bool]) -> JoinedSteps:
         """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick."""
         spheres = self.spheres
         clock, pairs = clock_launch(spheres), pair_launch(spheres, spheres.dt)
-        motion, meter = spheres.press.motion(), spheres.press.meter()
+        motion = spheres.press.motion()
+        meter = [*spheres.press.meter(), *spheres.grips.meter()]
         drift = self.launch(BEGIN)
         drift.name = "drift"
         middle = [pairs, clock, self.launch(LOADS | END | BEGIN), *meter, *motion]

@@ -11,7 +11,7 @@ import math
 
 from warpfiber.laws.rotation import LARGEST_HALF_ANGLE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
-from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, SETTLING, BondFeatures
+from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
 
@@ -28,6 +28,7 @@ def _constants(features: BondFeatures) -> str:
         "HAS_LOADS": features.loads,
         "HAS_WALLS": any(features.walls),
         "HAS_PAIRS": features.pairs,
+        "HAS_GRIPS": features.grips,
     }
     lines = [f"constexpr bool {key} = {str(value).lower()};" for key, value in flags.items()]
     tables = {
@@ -47,6 +48,7 @@ def _constants(features: BondFeatures) -> str:
         "SLOT_END_SPEED": END_SPEED,
         "IS_FREE": FREE,
         "IS_CLAMPED": CLAMPED,
+        "IS_LOWER": LOWER,
         "LOADS": LOADS,
         "END": END,
         "BEGIN": BEGIN,
@@ -55,7 +57,7 @@ def _constants(features: BondFeatures) -> str:
     return "\n".join(lines)
 
 
-# Loads of pairs and walls, fiber by fiber: few nodes have any.
+# Loads of pairs, fiber by fiber: few nodes have any.
 _GATHER = """
     for (int c = 0; c < 3 * nodes; ++c) a[c] = b[c] = V(T(0));
     if constexpr (HAS_PAIRS) {
@@ -88,15 +90,6 @@ _GATHER = """
             }
         }
     }
-    if constexpr (HAS_WALLS)
-        for (int l = 0; l < own; ++l)
-            for (int k = 0; k < nodes; ++k)
-                if (node_touches[first[l] + k])
-                    for (int c = 0; c < 3; ++c) {
-                        const long from = 3L * (first[l] + k) + c;
-                        ((T*)(a + 3 * k + c))[l] += ((const T*)node_push)[from];
-                        ((T*)(b + 3 * k + c))[l] += ((const T*)node_couple)[from];
-                    }
 """
 
 _RATES = """
@@ -106,6 +99,21 @@ _RATES = """
                 status[SLOT_TORN] = 1;
                 status[SLOT_BAD_FIBER] = fiber[l];
             }
+    if constexpr (HAS_GRIPS)
+        for (int l = 0; l < own; ++l)
+            for (int k = 0; k < nodes; ++k)
+                if (node_hold[first[l] + k] >= IS_LOWER)
+                    for (int c = 0; c < 3; ++c)
+                        ((T*)node_grip)[3L * (first[l] + k) + c] = ((T*)(a + 3 * k + c))[l];
+    if constexpr (HAS_WALLS)
+        for (int l = 0; l < own; ++l)
+            for (int k = 0; k < nodes; ++k)
+                if (node_touches[first[l] + k])
+                    for (int c = 0; c < 3; ++c) {
+                        const long from = 3L * (first[l] + k) + c;
+                        ((T*)(a + 3 * k + c))[l] += ((const T*)node_push)[from];
+                        ((T*)(b + 3 * k + c))[l] += ((const T*)node_couple)[from];
+                    }
     const V3 weight = same3(g.weight[0], g.weight[1], g.weight[2]);
     const V settling = V(stage[SLOT_SETTLING]);
     for (int k = 0; k < nodes; ++k) {
@@ -132,7 +140,7 @@ _HOLD = """
                         ((T*)(a + 3 * k + c))[l] = T(0);
                         ((T*)&speed)[c * W + l] =
                             ((const T*)node_load)[3L * (first[l] + k) + c];
-                        if (hold == IS_CLAMPED) {
+                        if (hold >= IS_CLAMPED) {
                             ((T*)(b + 3 * k + c))[l] = T(0);
                             ((T*)&spin)[c * W + l] = T(0);
                         }
