@@ -223,8 +223,8 @@ class Executor:
             wp.capture_launch(self._batch)
             steps -= batch
 
-    def time_step(self) -> StepTimes:
-        """Seconds of every launch over one real step by one worker."""
+    def time_step(self) -> StepTimes | None:
+        """Seconds of every launch over one real step by one worker; None if none could be timed."""
         if not self._apart:
             self._idle = self._capture_apart([])
             self._apart = [(self._capture_apart(flat([item])), item) for item in self.items]
