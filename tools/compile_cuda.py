@@ -43,6 +43,7 @@ from warpfiber.passes.contact_memory import make_carry_memory
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
+from warpfiber.passes.grip_meter import make_grip_meter, make_grip_sum
 from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.measure import (
@@ -200,6 +201,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
         ),
         ("bed", bed, (False, True)),
         ("pressed bed", replace(bed, press=2), (False, True)),
+        ("gripped bed", replace(bed, press=2, loads=True, grips=True), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
 
@@ -242,6 +244,8 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
+    yield "sum_grips", "", make_grip_sum(precision)
+    yield "meter_grips", "", make_grip_meter()
     yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)

@@ -184,6 +184,10 @@ class Method(ABC):
         """Steps before which the method's own condition surely does not end it; None without."""
         return None
 
+    def stage_result(self, stage: Stage) -> dict[str, float]:
+        """What the whole stage under way has shown, SI; nothing for most."""
+        return {}
+
     def unmet(self, stage: Stage) -> str:
         """What that condition still waits for."""
         return ""

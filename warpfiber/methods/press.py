@@ -2,7 +2,8 @@
 
 A stage begins with a jump of its wall to the outermost fiber, if that lies further in; it then
 moves at the stage's speed, inwards to compress and outwards to unload. The pressure that ends a
-stage is the mean of the last steps; of `unload` also no touch at all.
+stage is the mean of the last steps; of `unload` also no touch at all. A stage that grips the bed
+begins with the upper wall back at the top of the box, where it leaves the bed free.
 Symbols: place of a wall, push = the normal force of all fibers on it, gap = distance of the two.
 """
 
@@ -19,6 +20,7 @@ from warpfiber.passes.executor import Launch
 from warpfiber.passes.wall_press import CHUNK, make_push_sum, make_wall_meter, make_wall_motion
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.scene.derived import fiber_volume
+from warpfiber.scene.gripping import GRIPPING, HEIGHT
 from warpfiber.scene.pressing import PRESSING, pressed_axis, wall_side
 
 LOOK = 16  # steps from one look at the pressure to the next
@@ -83,6 +85,8 @@ class Press:
         if self.axis < 0:
             return
         velocity = np.zeros((1, 2))
+        if stage.kind in GRIPPING and self.axis == HEIGHT:
+            self._set_places(np.array([self.place.numpy()[0], self.corners[1]]))
         if stage.kind in PRESSING:
             side = wall_side(stage)
             inward = 1.0 - 2.0 * side
@@ -102,6 +106,10 @@ class Press:
             place[1, self.axis] = min(place[1, self.axis], (along + mine).max())
         else:
             place[0, self.axis] = max(place[0, self.axis], (along - mine).min())
+        self._set_places(place)
+
+    def _set_places(self, place: np.ndarray) -> None:
+        """Put the walls elsewhere; the mean distance starts anew."""
         self.place.assign(place)
         mean = self.mean.numpy()
         mean[0, 2] = self._gap()

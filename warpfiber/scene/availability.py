@@ -19,12 +19,12 @@ class Row:
     advice: str
 
 
-STAGE_ADVICE = 'only kind = "flow", "settle", "compress" and "unload" run'
+STAGE_ADVICE = 'only kind = "flow", "settle", "compress", "unload", "pull" and "shear" run'
 
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("stage", "kind", ("flow", "settle", "compress", "unload"), STAGE_ADVICE),
+    Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
     Row("stage", "control", ("displacement",), 'use control = "displacement" and end_pressure'),
     Row("stage", "pressure_rate", (), "remove it; the wall moves at speed"),
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
@@ -81,8 +81,8 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (
-        Row("stage", "kind", ("settle", "compress", "unload"),
-            'there is no fluid; use kind = "settle", "compress" or "unload"'),
+        Row("stage", "kind", ("settle", "compress", "unload", "pull", "shear"),
+            'there is no fluid; use kind = "settle", "compress", "unload", "pull" or "shear"'),
         Row("contact", "law", ("none", "hertz"), 'use law = "hertz", or "none"'),
         Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
         Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),

@@ -12,6 +12,7 @@ from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
 from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
+from warpfiber.scene.gripping import GRIPPING, check_gripping
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
 from warpfiber.scene.pressing import check_pressing
@@ -47,6 +48,7 @@ def cross_check(draft: Draft) -> None:
     _check_record(draft)
     check_loads(draft)
     check_pressing(draft)
+    check_gripping(draft)
 
 
 def _check_tables(draft: Draft) -> None:
@@ -316,6 +318,8 @@ def _check_rest(draft: Draft) -> None:
     if not still:
         return
     for index, stage in enumerate(draft.stages):
+        if stage["kind"] in GRIPPING:  # have a strain of their own
+            continue
         if stage["end_strain"] is not None and stage["end_time"] is None:
             draft.blame(f"stage.{index}.end_strain", "the fluid rests; end the stage by end_time")
     if draft.record["every_strain"] is not None:

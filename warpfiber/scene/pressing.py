@@ -9,6 +9,7 @@ import math
 
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
+from warpfiber.scene.gripping import GRIPPING
 from warpfiber.scene.keys import Values
 from warpfiber.scene.scene import Scene, Stage
 
@@ -42,7 +43,8 @@ def passing_time(draft: Draft, stage: Values) -> float | None:
 
 def check_pressing(draft: Draft) -> None:
     """Run all rules; faults go to the draft's list."""
-    if "stress" in (draft.record["quantities"] or ()) and not draft.axes("wall"):
+    gripped = any(stage["kind"] in GRIPPING for stage in draft.stages)
+    if "stress" in (draft.record["quantities"] or ()) and not draft.axes("wall") and not gripped:
         if draft.method == "bonded_spheres" and not draft.faulty("box"):
             remedy = 'it is the pressure on walls; make an axis "wall" in box.boundary'
             draft.blame("record.quantities", remedy)

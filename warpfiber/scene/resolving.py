@@ -11,6 +11,7 @@ import math
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
+from warpfiber.scene.gripping import GRIPPING, strain_time
 from warpfiber.scene.keys import Values
 from warpfiber.scene.pressing import PRESSING, passing_time
 from warpfiber.scene.statistics import resolve_layers, resolve_lengths
@@ -257,7 +258,7 @@ def _resolve_contact(draft: Draft) -> None:
 def _resolve_stages(draft: Draft) -> None:
     """Name the stages, and limit the time of those that no strain or time ends.
 
-    A wall on its way limits it by itself.
+    A wall on its way limits it by itself; the strain of grips is a time.
     """
     for index, stage in enumerate(draft.stages):
         if stage["name"] is None:
@@ -267,6 +268,11 @@ def _resolve_stages(draft: Draft) -> None:
             stage["time_limit"] = passing_time(draft, stage) or 100.0
         if stage["kind"] in PRESSING and stage["control"] is None:
             stage["control"] = "displacement"
+        seconds = strain_time(stage)
+        if seconds is not None:
+            stage["end_time"] = min(seconds, stage["end_time"] or seconds)
+        if stage["kind"] in GRIPPING and stage["freeze"] is None:
+            stage["freeze"] = "fibers"
         if stage["repeat"] is None:
             stage["repeat"] = 1
 
