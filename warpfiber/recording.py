@@ -10,9 +10,10 @@ import numpy as np
 
 from warpfiber.output.columns import write_columns
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.placement_table import write_placement
 from warpfiber.output.scalars import ScalarsWriter
 from warpfiber.output.trajectory import TrajectoryWriter
-from warpfiber.scene import Scene
+from warpfiber.scene import Scene, Stage
 from warpfiber.simulation import Simulation
 
 MOMENT = ("step", "time", "strain")
@@ -44,7 +45,7 @@ class Recording:
         folder: ResultFolder,
         attrs: Mapping[str, Any],
     ) -> Recording:
-        """New files; `attrs` go into the trajectory. Raises RecordError."""
+        """New files, `placement.csv` whole; `attrs` go into the trajectory. Raises RecordError."""
         scalars = ScalarsWriter(folder.scalars_path, list(simulation.measure()))
         columns = {folder.scalars_path.name: scalars.columns}
         layers = trajectory = None
@@ -53,6 +54,7 @@ class Recording:
             layers = ScalarsWriter(folder.layers_path, names)
             columns[folder.layers_path.name] = layers.columns
         write_columns(folder.path / "columns.csv", columns)
+        write_placement(folder.path / "placement.csv", simulation.placement_report)
         if scene.record.trajectory:
             trajectory = TrajectoryWriter(
                 folder.trajectory_path,
@@ -87,6 +89,28 @@ class Recording:
     def row_step(self) -> int:
         """Step of the last row, -1 before the first."""
         return int(self.last_row.get("step", -1))
+
+    def row_interval(self, stage: Stage) -> tuple[str, float]:
+        """What counts ("strain" or "time") from row to row of a stage, and how much of it."""
+        return self._share(stage, self.scene.record.scalars)
+
+    def frame_interval(self, stage: Stage) -> tuple[str, float]:
+        """The same from frame to frame."""
+        record = self.scene.record
+        if record.every_strain is not None:
+            return "strain", record.every_strain
+        if record.every_time is not None:
+            return "time", record.every_time
+        return self._share(stage, record.frames or 100)
+
+    def _share(self, stage: Stage, count: int) -> tuple[str, float]:
+        """`count` even parts of the whole run, in strain where the stages end by strain."""
+        flow, stages = self.scene.flow, self.scene.stage_sequence
+        if stage.end_strain is not None and flow is not None and flow.rate > 0.0:
+            ends = [s.end_strain for s in stages]
+            return "strain", sum(e for e in ends if e is not None) / count
+        times = [s.end_time or s.time_limit for s in stages]
+        return "time", sum(t for t in times if t is not None) / count
 
     def write_row(self) -> dict[str, float]:
         """Measure now and append the row."""

@@ -22,6 +22,7 @@ from warpfiber.passes.executor import Launch
 from warpfiber.passes.held_nodes import FREE, FROZEN
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.precision import group_struct
+from warpfiber.passes.unilateral import ContactDual
 
 
 @cache
@@ -35,7 +36,7 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
     Group = group_struct(name)
     Row = elimination_row(name)
     chain_reply = make_chain_reply(name)
-    chi = real(CHI)
+    chi, zero, one = real(CHI), real(0.0), real(1.0)
     options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.kernel(**options)
@@ -120,8 +121,16 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         offset: wp.int32,
         again: wp.int32,
         fiber_node_start: wp.array(dtype=wp.int32),
-        end_start: wp.array(dtype=wp.int32),
-        node_push: wp.array(dtype=vec3),
+        row_count: wp.array(dtype=wp.int32),
+        row_out_start: wp.array(dtype=wp.int32),
+        in_start: wp.array(dtype=wp.int32),
+        in_pair: wp.array(dtype=wp.int32),
+        pair_row: wp.array(dtype=wp.int32),
+        pair_row_count: wp.array(dtype=wp.int32),
+        row_s: wp.array(dtype=real),
+        row_t: wp.array(dtype=real),
+        row_normal: wp.array(dtype=vec3),
+        row_force: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
         new_load: wp.array(dtype=vec3),
     ):
@@ -129,14 +138,34 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         if status[wp.static(HALT)] != 0:
             return
         fiber = wp.tid() + offset
-        pushed = end_start[fiber] < end_start[fiber + 1]
-        for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
-            load = vec3()
-            if again != 0:
-                load = new_load[i]
-            if pushed:
-                load += node_push[i]
-            new_load[i] = load
+        first = fiber_node_start[fiber]
+        segments = fiber_node_start[fiber + 1] - first - 1
+        if again == 0:
+            for i in range(first, first + segments + 1):
+                new_load[i] = vec3()
+        if row_count[0] == 0 or row_count[0] > row_force.shape[0]:
+            return
+        behind = vec3()
+        for k in range(segments):
+            segment = first - fiber + k
+            here = behind
+            behind = vec3()
+            for own in range(row_out_start[segment], row_out_start[segment + 1]):
+                force = row_force[own]
+                if force != zero:
+                    push = force * row_normal[own]
+                    here -= (one - row_s[own]) * push
+                    behind -= row_s[own] * push
+            for incoming in range(in_start[segment], in_start[segment + 1]):
+                begin = pair_row[in_pair[incoming]]
+                for r in range(begin, begin + pair_row_count[in_pair[incoming]]):
+                    force = row_force[r]
+                    if force != zero:
+                        push = force * row_normal[r]
+                        here += (one - row_t[r]) * push
+                        behind += row_t[r] * push
+            new_load[first + k] = new_load[first + k] + here
+        new_load[first + segments] = new_load[first + segments] + behind
 
     @wp.kernel(**options)
     def keep_load(
@@ -155,7 +184,7 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         is_loaded = wp.uint8(0)
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
             contact_load_out[i] = new_load[i]
-            if wp.length_sq(new_load[i]) > real(0.0):
+            if wp.length_sq(new_load[i]) > zero:
                 is_loaded = wp.uint8(1)
         fiber_loaded_out[fiber] = is_loaded
 
@@ -222,14 +251,22 @@ class ChainLoad:
         ]
         return self._launch("take_off", inputs, follows=True)
 
-    def note(self, again: bool) -> Launch:
+    def note(self, dual: ContactDual, again: bool) -> Launch:
         """After a solve: its forces on the nodes."""
-        model, response = self.model, self.response
+        rows = dual.rows
         inputs = [
             1 if again else 0,
-            model.fiber_node_start,
-            response.end_start,
-            response.node_push,
+            self.model.fiber_node_start,
+            rows.row_count,
+            rows.row_out_start,
+            dual.pairs.in_start,
+            dual.pairs.in_pair,
+            rows.pair_row,
+            rows.pair_row_count,
+            rows.row_s,
+            rows.row_t,
+            rows.row_normal,
+            rows.row_force,
             self.state.status,
             self.new_load,
         ]
