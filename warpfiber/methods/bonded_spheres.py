@@ -21,6 +21,7 @@ from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
+    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
@@ -31,11 +32,15 @@ from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
-from warpfiber.passes.executor import Call, Executor, Launch, Repeat
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
+from warpfiber.passes.native_bonds import native_bonds_apply
+from warpfiber.passes.native_bonds_source import LOADS
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.gripping import GRIPPING
+
+NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
@@ -56,16 +61,16 @@ class BondedSpheres(Method):
         p, device, nodes = model.precision, model.device, model.node_count
         self.started = False
         self.bed = BedStages(self)
-        self.press = self.bed.press
+        self.press, self.grips, self.holds = self.bed.press, self.bed.grips, self.bed.holds
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
-            loads=self.bed.holds.used,
+            loads=self.holds.used,
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
             wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
             press=self.press.axis,
-            grips=self.bed.grips.used,
+            grips=self.grips.used,
         )
         self.groups = wp.array(
             [self._group(group) for group in scene.fibers],
@@ -95,6 +100,9 @@ class BondedSpheres(Method):
             self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
+        self.native: NativeBonds | None = None
+        if NATIVE and native_bonds_apply(model, self.features):
+            self.native = NativeBonds(self)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -140,7 +148,7 @@ class BondedSpheres(Method):
     def launches(self) -> list[Launch | Call | Repeat]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
         begin = [clock_launch(self), *self.press.motion()]
-        end = [*self.press.meter(), *self.bed.grips.meter()]
+        end = [*self.press.meter(), *self.grips.meter()]
         if self.contacts is None:
             return [*begin, bond_launch(self, drifts=True, kicks=True), *end]
         return [
@@ -168,21 +176,33 @@ class BondedSpheres(Method):
             kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
         if self.contacts is not None:
             kernels += self.contacts.kernels()
-        super().prepare(kernels)
+        self._prepare_steps(kernels)
         if self.started:
             return
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        first: list[Launch | Call | Repeat] = [bond_launch(self, drifts=False, kicks=False)]
+        first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
             if self.contacts.build(self.step_count):
                 self._stop_executor()
-                super().prepare()  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), bond_launch(self, drifts=False, kicks=False)]
+                self._prepare_steps([])  # a list that grew has other arrays
+            first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
+
+    def _prepare_steps(self, kernels: list[Any]) -> None:
+        if self.executor is None and self.native is not None:
+            load_kernels([*self.native.kernels(), *kernels], self.model.device)
+            self.executor = self.native.steps(self._halted)
+        super().prepare(kernels)
+
+    def _rates(self) -> Launch:
+        """Accelerations of the start."""
+        if self.native is not None:
+            return self.native.launch(LOADS)
+        return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
         """Build the list anew if it has expired; False if a fiber tore."""
@@ -234,13 +254,17 @@ class BondedSpheres(Method):
                 return False
         return True
 
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """As of every method; nothing while fibers are poured, which is between steps."""
+        return {} if self.bed.pour.waits else super().time_passes(steps)
+
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which no condition but strain and time surely ends the stage."""
         return self.bed.steps_left(stage)
 
     def stage_result(self, stage: Stage) -> dict[str, float]:
         """Yield stress of a bed that is pulled or sheared."""
-        return self.bed.grips.result() if stage.kind in GRIPPING else {}
+        return self.grips.result() if stage.kind in GRIPPING else {}
 
     def unmet(self, stage: Stage) -> str:
         """What the stage still waits for."""
@@ -250,7 +274,7 @@ class BondedSpheres(Method):
 
     def measure(self) -> dict[str, float]:
         """Energies in J and what walls feel, where `record.quantities` asks for them."""
-        pressed = self.press.measure() | self.bed.grips.measure()
+        pressed = self.press.measure() | self.grips.measure()
         if "energy" not in self.scene.record.quantities:
             return pressed
         model, walls = self.model, self.features.walls

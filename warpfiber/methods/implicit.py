@@ -18,6 +18,7 @@ from warpfiber.methods.contact import ImplicitContact, MovingResponse, StepArray
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import EXPIRED, TORN, Model, State
+from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat, flat, load_kernels
 from warpfiber.passes.fiber_stress import FiberStress
 from warpfiber.passes.kernel_module import kernel_module
@@ -258,10 +259,10 @@ class Implicit(Method):
 
     def measure(self) -> dict[str, float]:
         """Stress of the fibers, Pa, where it is asked for."""
-        if self.stress is None:
-            return {}
-        solves = self.contact.solves if self.contact is not None else []
-        return self.stress.measure(rows for rows, _ in solves)
+        return self.stress.measure(self._solved_rows()) if self.stress is not None else {}
+
+    def _solved_rows(self) -> list[ContactRows]:
+        return [rows for rows, _ in self.contact.solves] if self.contact is not None else []
 
     def saved(self) -> dict[str, np.ndarray]:
         """Sizes of steps, and what contact depends on."""
@@ -269,12 +270,16 @@ class Implicit(Method):
             f"implicit_{name}": getattr(self, name).numpy().copy()
             for name in ("step_size", "rejected")
         }
+        if self.stress is not None:
+            arrays["implicit_stress"] = self.stress.saved(self._solved_rows())
         return arrays | (self.contact.saved() if self.contact is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in ("step_size", "rejected"):
             getattr(self, name).assign(arrays[f"implicit_{name}"])
+        if self.stress is not None:
+            self.stress.restore(arrays["implicit_stress"])
         if self.contact is not None:
             self.contact.restore(arrays, self.step_count)
             self._stop_executor()

@@ -43,18 +43,15 @@ class FiberStress:
         self.fiber_frozen = wp.array(fiber_frozen, dtype=wp.uint8, device=model.device)
         self.kernels = make_measure_stress(model.precision.name)
         self.center = wp.zeros(model.fiber_count, dtype=wp.vec3d, device=model.device)
+        # step and contact moments of a restored state: its rows are made by the next step
+        self.kept: tuple[int, np.ndarray] | None = None
 
     def measure(self, rows: Iterable[Any]) -> dict[str, float]:
         """Columns after a step; `rows`: each a `ContactRows` of it."""
         units = self.model.units
         box = abs(float(np.linalg.det(self.state.lattice.numpy()[0])))
         scale = units.force / units.length**2 / box
-        contact = np.zeros(len(STRESS))
-        drag = self._drag()
-        for solved in rows:
-            contact += self._contact(solved)
-        if int(self.state.step.numpy()[0]) == 0:
-            drag, contact = np.full_like(drag, np.nan), np.full_like(contact, np.nan)
+        drag, contact = self._moments(rows)
         total = scale * (drag + contact)
         found = dict(zip([f"stress_{k}" for k in STRESS], total, strict=True))
         parts = scale * contact
@@ -70,6 +67,28 @@ class FiberStress:
             found["normal_difference_1"] = total[0] - total[2]
             found["normal_difference_2"] = total[2] - total[1]
         return {name: float(value) for name, value in found.items()}
+
+    def saved(self, rows: Iterable[Any]) -> np.ndarray:
+        """Contact moments (6,) now, run units: what a restored state cannot tell."""
+        return self._moments(rows)[1] if self._step > 0 else np.zeros(len(STRESS))
+
+    def restore(self, contact: np.ndarray) -> None:
+        """Take over what `saved` returned; the State has been restored."""
+        self.kept = self._step, np.asarray(contact)
+
+    @property
+    def _step(self) -> int:
+        return int(self.state.step.numpy()[0])
+
+    def _moments(self, rows: Iterable[Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Moments (6,) of drag and of contact, run units; nan before the first step."""
+        step, unknown = self._step, np.full(len(STRESS), np.nan)
+        if step == 0:
+            return unknown, unknown
+        drag = self._drag()
+        if self.kept is not None and self.kept[0] == step:
+            return drag, self.kept[1]
+        return drag, sum((self._contact(solved) for solved in rows), np.zeros(len(STRESS)))
 
     def _drag(self) -> np.ndarray:
         """Moments (6,) of the drag of all fibers, run units; leaves their middles."""
