@@ -32,7 +32,7 @@ from warpfiber.scene.schema import (
     TOP,
     WALL,
 )
-from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape
+from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape, Wall
 
 T = TypeVar("T")
 TOML_PLACE = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
@@ -251,6 +251,7 @@ def _finished(
             for group in draft.fibers
         ),
         contact=_made(Contact, draft.contact),
+        walls=tuple(_made(Wall, wall) for wall in draft.walls),
         gravity=_made(Gravity, draft.gravity) if draft.gravity is not None else None,
         loads=tuple(_made(Load, load) for load in draft.loads),
         stages=tuple(_made(Stage, stage) for stage in draft.stages),
