@@ -68,6 +68,7 @@ from warpfiber.passes.step_control import (
     make_take_back,
 )
 from warpfiber.passes.wall_press import make_push_sum, make_wall_meter, make_wall_motion
+from warpfiber.passes.wall_servo import make_wall_servo
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
@@ -244,6 +245,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
+    yield "steer_wall", "", make_wall_servo()
     yield "sum_grips", "", make_grip_sum(precision)
     yield "meter_grips", "", make_grip_meter()
     yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))

@@ -21,6 +21,7 @@ import warp as wp
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
+    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
@@ -33,13 +34,16 @@ from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
-from warpfiber.passes.executor import Call, Executor, Launch, Repeat
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
+from warpfiber.passes.native_bonds import native_bonds_apply
+from warpfiber.passes.native_bonds_source import LOADS
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.gripping import GRIPPING
 from warpfiber.scene.pressing import PRESSING
 
+NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
 # Arrays that the next step depends on beside the State.
@@ -102,6 +106,9 @@ class BondedSpheres(Method):
             self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
+        self.native: NativeBonds | None = None
+        if NATIVE and native_bonds_apply(model, self.features):
+            self.native = NativeBonds(self)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -170,21 +177,33 @@ class BondedSpheres(Method):
             kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
         if self.contacts is not None:
             kernels += self.contacts.kernels()
-        super().prepare(kernels)
+        self._prepare_steps(kernels)
         if self.started:
             return
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        first: list[Launch | Call | Repeat] = [bond_launch(self, drifts=False, kicks=False)]
+        first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
             if self.contacts.build(self.step_count):
                 self._stop_executor()
-                super().prepare()  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), bond_launch(self, drifts=False, kicks=False)]
+                self._prepare_steps([])  # a list that grew has other arrays
+            first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
+
+    def _prepare_steps(self, kernels: list[Any]) -> None:
+        if self.executor is None and self.native is not None:
+            load_kernels([*self.native.kernels(), *kernels], self.model.device)
+            self.executor = self.native.steps(self._halted)
+        super().prepare(kernels)
+
+    def _rates(self) -> Launch:
+        """Accelerations of the start."""
+        if self.native is not None:
+            return self.native.launch(LOADS)
+        return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
         """Build the list anew if it has expired; False if a fiber tore."""

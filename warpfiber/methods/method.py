@@ -134,7 +134,7 @@ class Method(ABC):
             assert self.executor is not None
             taken = self.step_count
             found = self.executor.time_step()
-            if self.step_count > taken:
+            if found is not None and self.step_count > taken:
                 times.append(found)
             # a torn fiber is left to the next `advance`
             if len(times) == steps or (self._halted() and not self._settle()):

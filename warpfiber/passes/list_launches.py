@@ -41,7 +41,6 @@ def _bin(pairs: NeighborList) -> Launches:
             pairs,
             "place_fibers",
             model.fiber_count,
-            0,
             pairs.wraps,
             state.lattice,
             state.gradient,
@@ -50,7 +49,6 @@ def _bin(pairs: NeighborList) -> Launches:
             state.node_velocity,
             state.fiber_image,
             state.list_pos,
-            split=False,
         ),
         _launch(
             pairs,
@@ -112,23 +110,20 @@ def _gather(pairs: NeighborList) -> Launch:
 
 
 # -- CPU: native search and sorts -----------------------------------------------------------------
-# Only what takes longer than waking the other workers is split. Of 225 ns per segment (20,000
-# segments) 5 are left to one worker: the sort into cells and the fibers put into the box.
+# All workers share every launch but the one that counts the cells.
 
 
 def _native_sort(pairs: NeighborList) -> Launch:
     return _launch(
         pairs,
         "sort_cells",
-        1,
-        0,
-        1,
+        pairs.workers,
+        pairs.workers,
         pairs.cells,
         pairs.piece_total,
         pairs.cell_key,
         pairs.cell_start,
         pairs.order,
-        split=False,
     )
 
 

@@ -271,7 +271,8 @@ class NeighborList:
                 self._wraps = int(wrap)
                 self.wraps.fill_(self._wraps)
             if self._executor is None:
-                self._executor = Executor(list_launches(self), self.model.device, self.workers)
+                launches, device = list_launches(self), self.model.device
+                self._executor = Executor(launches, device, self.workers, single=True)
             self._executor.run(1, _never)
             status = self.state.status.numpy()
             overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])

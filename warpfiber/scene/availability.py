@@ -25,9 +25,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
-    Row("stage", "control", ("displacement",), 'use control = "displacement" and end_pressure'),
-    Row("stage", "pressure_rate", (), "remove it; the wall moves at speed"),
-    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
                                  "curvature", "stress"),
@@ -35,7 +32,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("wall", "kind", ("fiber_array",),
         'remove the table; planes come from boundary = "wall", stages move them'),
-    Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
 
@@ -50,6 +46,7 @@ FLOWING = (
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_volume_fraction", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_pressure", (), "end the stage by end_strain or end_time"),
+    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
 )

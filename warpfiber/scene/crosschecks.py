@@ -18,6 +18,7 @@ from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
+from warpfiber.scene.starting import check_saving
 from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
@@ -51,15 +52,12 @@ def cross_check(draft: Draft) -> None:
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)
+    check_saving(draft)
 
 
 def _check_tables(draft: Draft) -> None:
     """Ask for the tables that a scene, or its method, cannot do without."""
-    if draft.start is not None:
-        for name in ("fibers", "box"):
-            if draft.is_given(name):
-                draft.faults.add(name, None, "given together with [start]; [start] brings it")
-    elif not draft.fibers and not draft.faulty("fibers"):
+    if draft.start is None and not draft.fibers and not draft.faulty("fibers"):
         draft.faults.add("fibers", None, "missing; add at least one [[fibers]]")
     if not draft.stages and not draft.faulty("stage"):
         draft.faults.add("stage", None, 'missing; add a [[stage]] with kind = "flow"')
