@@ -18,6 +18,7 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import HALT, precision
+from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import make_closest_points, make_wall_gap
@@ -37,6 +38,7 @@ class CheckFeatures:
     periodic: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     frozen: bool = False  # some fibers are; nothing moves two of them, or one from a wall
+    arrays: bool = False  # some walls are arrays of fibers
 
 
 @cache
@@ -158,12 +160,14 @@ def make_crossing(planar: float):
 def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"):
     """`check_segments`, `reduce_check`, `finish_check` in launch order, as a dict by name."""
     p = precision(name)
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     closest_points = make_closest_points(name)
     has_crossed = make_crossing(PLANAR[name])
     _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=features.periodic))
     has_wall, wall_gap = make_wall_gap(name, features.walls)
+    is_near_array, array_place, _ = make_array_rows(name)
+    has_arrays = features.arrays
     zero = real(0.0)
     lost = real(1e30)
     periodic = features.periodic
@@ -176,6 +180,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         widest: real,
         wall_low: vec3,
         wall_high: vec3,
+        wall_array: wp.array(dtype=vec2),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -267,6 +272,13 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
                     if has_wall(axis):
                         for side in range(2):
                             y = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
+                            if wp.static(has_arrays):
+                                behind = wall_array[2 * axis + side][1]
+                                if behind > zero:  # past the middles of its fibers
+                                    if y + behind < zero:
+                                        crossed += 1
+                                        crossed_partner = -1
+                                    continue
                             overlap = (radius - y) / radius
                             if overlap > largest:
                                 largest = overlap
@@ -274,6 +286,32 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
                             if y < zero:
                                 crossed += 1
                                 crossed_partner = -1
+            if wp.static(has_arrays):
+                begin = 2 * first
+                if first == 2:
+                    begin = wp.static(PLACES)
+                for axis in range(1, 3):
+                    for side in range(2):
+                        shape = wall_array[2 * axis + side]
+                        if shape[1] == zero or not is_near_array(
+                            xi, xi + a, axis, side, wall_low, wall_high, radius
+                        ):
+                            continue
+                        for place in range(begin, wp.static(PLACES)):
+                            _t, _n, gap = array_place(
+                                place,
+                                xi,
+                                xi + a,
+                                axis,
+                                side,
+                                wall_low,
+                                wall_high,
+                                shape,
+                                radius,
+                            )
+                            if -gap / radius > largest:
+                                largest = -gap / radius
+                                partner = -1
         overlap_out[i] = largest
         overlap_partner_out[i] = partner
         crossed_out[i] = crossed

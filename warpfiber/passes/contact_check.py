@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch
@@ -49,7 +50,8 @@ class ContactCheck:
         domain, name = model.domain, model.precision.name
         none = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
-        features = CheckFeatures(any(domain.periodic), domain.wall, fiber_frozen is not None)
+        frozen, arrays = fiber_frozen is not None, bool(domain.arrays)
+        features = CheckFeatures(any(domain.periodic), domain.wall, frozen, arrays)
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))
         self.kernels |= make_list_bound(name, module)
@@ -82,6 +84,7 @@ class ContactCheck:
             p.real(widest),
             p.vec3(*low),
             p.vec3(*(low + np.asarray(domain.size))),
+            wall_arrays(model),
             model.groups,
             model.fiber_node_start,
             model.fiber_group,
