@@ -134,7 +134,7 @@ class Method(ABC):
             assert self.executor is not None
             taken = self.step_count
             found = self.executor.time_step()
-            if self.step_count > taken:
+            if found is not None and self.step_count > taken:
                 times.append(found)
             # a torn fiber is left to the next `advance`
             if len(times) == steps or (self._halted() and not self._settle()):
@@ -183,6 +183,10 @@ class Method(ABC):
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which the method's own condition surely does not end it; None without."""
         return None
+
+    def stage_result(self, stage: Stage) -> dict[str, float]:
+        """What the whole stage under way has shown, SI; nothing for most."""
+        return {}
 
     def unmet(self, stage: Stage) -> str:
         """What that condition still waits for."""

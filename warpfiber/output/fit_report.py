@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from warpfiber.output.axes_style import GRAY, INK, plain_axes
 from warpfiber.output.cell_picture import AXIS_COLORS
-from warpfiber.output.curves import GRAY, INK
 from warpfiber.output.fit import CLOSURES, CONFIDENCE, MODELS, Estimate, Fitted, fit_model, selected
 from warpfiber.output.folder import ResultFolder
 from warpfiber.output.orientation_curve import (
@@ -208,11 +208,7 @@ def draw_fit(
     axes.set_ylabel("orientation tensor component", color=INK)
     axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.0)
     axes.margins(x=0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(color=GRAY, labelcolor=GRAY, labelsize=9)
-    axes.grid(True, color="#e6e8eb", linewidth=0.8)
-    axes.set_axisbelow(True)
+    plain_axes(axes)
     with record_errors(path, "write"):
         figure.savefig(path)
 

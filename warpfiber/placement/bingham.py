@@ -43,21 +43,20 @@ def bingham_exponents(eigen: Floats) -> Floats:
     a /= a.sum()
     if len(a) == 2:  # in the plane of both
         return _plane_exponents(a)
-    b: Floats = np.zeros(3)
-    value = -np.inf
-    move = np.zeros(3)
+    b: Floats = np.asarray(np.zeros(3))
+    move, value = b, -np.inf
     for _ in range(UPDATES):
-        trial = b + move
-        trial -= trial.max()
+        trial: Floats = np.asarray(b + move - np.max(b + move), dtype=np.float64)
         reached = float(a @ trial) - _log_weight(trial)
         if reached < value:
-            move = 0.5 * move
+            move = np.asarray(0.5 * move, dtype=np.float64)
             continue
         b, value = trial, reached
         got, fourth = bingham_moments(b)
         if np.max(np.abs(got - a)) < CLOSE:
             break
-        move = np.linalg.lstsq(fourth - np.outer(got, got), a - got, rcond=1e-14)[0]
+        slope = fourth - np.outer(got, got)
+        move = np.asarray(np.linalg.lstsq(slope, a - got, rcond=1e-14)[0], dtype=np.float64)
     return b
 
 
