@@ -201,7 +201,7 @@ NOT_SPHERES: list[tuple[dict[str, object], str, str]] = [
     ({"contact.law": "exponential"}, "contact.law", '"hertz"'),
     ({"stage.0.kind": "flow"}, "stage.0.kind", 'use kind = "settle"'),
     ({"stage": [{"kind": "settle", "end_strain": 1}]}, "stage.0.end_strain", "end_time"),
-    ({"stage.0.kind": "pour"}, "stage.0.kind", "not available"),
+    ({"stage.0.kind": "pour"}, "stage.0.kind", "add [gravity] that points down"),
     ({"numerics.strain_step": 0.1}, "numerics.strain_step", "give dt in s"),
     ({"fibers.0.bending_modulus": 0}, "fibers.0.bending_modulus", "give > 0"),
     ({"fibers.0.poisson_ratio": 0.6}, "fibers.0.poisson_ratio", "0.5"),

@@ -218,19 +218,24 @@ class NativeBonds:
         """What a step launches."""
         launches = [clock_launch(self.spheres), pair_launch(self.spheres, 0.0)]
         launches += [self.launch(0), *self.spheres.press.motion(), *self.spheres.press.meter()]
-        launches += self.spheres.grips.meter()
+        launches += [*self.spheres.grips.meter(), *self.spheres.energies.losses()]
         return [launch.kernel for launch in launches]
 
     def steps(self, halted: Callable[[], bool]) -> JoinedSteps:
-        """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick."""
+        """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick.
+
+        What a step dissipates is found at its end, which is then a launch of its own.
+        """
         spheres = self.spheres
         clock, pairs = clock_launch(spheres), pair_launch(spheres, spheres.dt)
         motion = spheres.press.motion()
-        meter = [*spheres.press.meter(), *spheres.grips.meter()]
+        meter = [*spheres.press.meter(), *spheres.grips.meter(), *spheres.energies.losses()]
         drift = self.launch(BEGIN)
         drift.name = "drift"
         middle = [pairs, clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
         end = [pairs, self.launch(LOADS | END), *meter]
+        if spheres.energies.told:
+            middle = [*end, clock, *motion, drift]
         model = spheres.model
         return JoinedSteps(
             [clock, *motion, drift], middle, end, model.device, spheres.workers, halted

@@ -16,6 +16,7 @@ from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, check_gripping
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
+from warpfiber.scene.pouring import check_pouring
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.starting import check_saving
@@ -52,6 +53,7 @@ def cross_check(draft: Draft) -> None:
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)
+    check_pouring(draft)
     check_saving(draft)
 
 
