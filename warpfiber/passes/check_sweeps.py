@@ -1,7 +1,7 @@
 """Sweeps over the end of a step: overlaps, center lines that passed through each other, the list.
 
-One thread per segment looks at its outgoing pairs and its nodes; runs of segments are reduced in
-order, so the result does not depend on the workers.
+One thread per segment looks at its outgoing pairs that may have met and at its nodes; runs of
+segments are reduced in order, so the result does not depend on the workers.
 
 Source: four points that move in straight lines are in one plane where a cubic of the time is 0; the
     lines pass through each other there if they meet between their ends. The cubic is split at its
@@ -37,6 +37,8 @@ class CheckFeatures:
     periodic: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     frozen: bool = False  # some fibers are; nothing moves two of them, or one from a wall
+    shifted: bool = False  # it is known how near pairs come but for contact, and what that adds
+    again: bool = False  # twice
 
 
 @cache
@@ -189,6 +191,9 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         lattice_now: wp.array(dtype=mat33),
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        pair_clear: wp.array(dtype=real),
+        segment_shift: wp.array(dtype=real),
+        shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
         overlap_out: wp.array(dtype=real),
         overlap_partner_out: wp.array(dtype=wp.int32),
@@ -211,8 +216,19 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         crossed_partner = wp.int32(-1)
         if not (wp.length_sq(xi) < lost and wp.length_sq(a) < lost):
             largest = lost
+        mine = zero
+        if wp.static(features.shifted):
+            mine = segment_shift[i]
+            if wp.static(features.again):
+                mine += shift_again[i]
         for k in range(out_start[i], out_start[i + 1]):
             j = pair_j[k]
+            if wp.static(features.shifted):
+                shifted = mine + segment_shift[j]
+                if wp.static(features.again):
+                    shifted += shift_again[j]
+                if pair_clear[k] - shifted > real(2.0) * widest:
+                    continue
             node_j = segment_node[j]
             xj = node_pos[node_j]
             b = node_pos[node_j + 1] - xj
