@@ -6,6 +6,8 @@
     python tools/bench.py period                  Fig. 3: period of a rigid fiber against N_seg
     python tools/bench.py suspensions [NAME ...]  Figs. 6-9: reduced against full chains over seeds;
                                                   these two with --method auto: as shipped
+    python tools/bench.py dem                     a bed of bonded fibers under a plate: ns per
+                                                  node-step (--load: seconds of a whole loading)
     python tools/bench.py contact [PART ...]      implicit contact: overlaps, A_xx, time over that
                                                   of explicit steps (parts: see bench_contact.py)
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
@@ -26,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from bench_contact import contact_rows
+from bench_dem import dem_rows
 from bench_overdamped import overdamped_rows
 from bench_papers import period_rows, suspension_rows
 from machine import ROOT, SCENES, commit, processor
@@ -259,10 +262,15 @@ def contact(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     yield from contact_rows(args, common)
 
 
+def dem(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A bed of bonded fibers (`bench_dem`)."""
+    yield from dem_rows(args, common)
+
+
 def main() -> None:
     """Run one benchmark and append its rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact"]
+    benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact", "dem"]
     parser.add_argument("bench", choices=benches)
     parser.add_argument("names", nargs="*", help="cells of `suspensions`, parts of `contact`")
     parser.add_argument("--method", default="bead_chain", help="of `period`, `suspensions`")
@@ -275,6 +283,9 @@ def main() -> None:
     parser.add_argument("--precisions", nargs="*", default=["float64", "float32"])
     parser.add_argument("--cell-fibers", type=int, default=1000, help="of `contact`")
     parser.add_argument("--explicit", type=float, default=2.0, help="strain, of `contact`")
+    parser.add_argument("--fraction", type=float, default=0.29, help="where `dem` starts")
+    parser.add_argument("--steps", type=int, default=400, help="of one repeat of `dem`")
+    parser.add_argument("--load", action="store_true", help="`dem`: the whole loading")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=7)

@@ -31,21 +31,21 @@ import warp as wp
 from warpfiber.laws.contact_compliance import LAWS
 from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import make_measure_bonds
+from warpfiber.passes.bond_losses import make_bond_losses
 from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
-from warpfiber.passes.capsule_pairs import (
-    CapsuleFeatures,
-    make_capsule_pairs,
-    make_carry_memory,
-)
+from warpfiber.passes.capsule_pairs import CapsuleFeatures, make_capsule_pairs
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
 from warpfiber.passes.chain_response import make_chain_apply, make_chain_response
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.contact_energy import make_contact_energy
+from warpfiber.passes.contact_memory import make_carry_memory
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
+from warpfiber.passes.grip_meter import make_grip_meter, make_grip_sum
 from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.measure import (
@@ -54,6 +54,8 @@ from warpfiber.passes.measure import (
     make_measure_pairs,
     make_measure_terms,
 )
+from warpfiber.passes.measure_layers import make_measure_layers
+from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
@@ -68,6 +70,7 @@ from warpfiber.passes.step_control import (
     make_take_back,
 )
 from warpfiber.passes.wall_press import make_push_sum, make_wall_meter, make_wall_motion
+from warpfiber.passes.wall_servo import make_wall_servo
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
@@ -77,6 +80,8 @@ FRAMES: dict[str, tuple[int, str]] = {
     "bond_drift": (40, "as bond_sweep"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
 }
+
+STRESS_KERNELS = ("drag_moments", "contact_moments")
 
 FORMAT_SIZED = 0x04
 ATTRIBUTE_FRAME = 0x11
@@ -199,6 +204,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
         ),
         ("bed", bed, (False, True)),
         ("pressed bed", replace(bed, press=2), (False, True)),
+        ("gripped bed", replace(bed, press=2, loads=True, grips=True), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
 
@@ -241,7 +247,14 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
-    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
+    yield "steer_wall", "", make_wall_servo()
+    yield "sum_grips", "", make_grip_sum(precision)
+    yield "meter_grips", "", make_grip_meter()
+    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True), True)
+    for variant, bonds, _ in _bond_variants():
+        yield "bond_losses", variant, make_bond_losses(precision, bonds)
+    for is_step in (True, False):
+        yield "contact_energy", str(is_step), make_contact_energy(precision, rubbing, is_step)
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     yield from _dual_kernels(precision)
@@ -265,12 +278,13 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         for make in (make_cell_kernels, make_row_kernels):
             for name, kernel in make(precision, list_features).items():
                 yield name, variant, kernel
-    for variant, walls, lubrication in (
-        ("sheared", (False, False, False), "none"),
-        ("wall paper", (False, False, True), "paper"),
+    for variant, walls, lubrication, arrays in (
+        ("sheared", (False, False, False), "none", False),
+        ("wall paper", (False, False, True), "paper", False),
+        ("array", (False, False, True), "none", True),
     ):
-        features = RowFeatures(True, walls, lubrication)
-        checks = make_check_sweeps(precision, CheckFeatures(True, walls))
+        features = RowFeatures(True, walls, lubrication, arrays)
+        checks = make_check_sweeps(precision, CheckFeatures(True, walls, arrays=arrays))
         for name, kernel in (make_row_count(precision, features) | checks).items():
             yield name, variant, kernel
         yield "fill_rows", variant, make_row_fill(precision, features)
@@ -282,6 +296,11 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         "overdamped": MeasureFeatures(energy=True, curvature=True, inertia=False),
     }.items():
         yield "measure_fibers", variant, make_measure_fibers(precision, fibers)
+    for tensor4 in (False, True):
+        kernel = make_measure_layers(precision, tensor4)
+        yield "measure_layers", "everything" if tensor4 else "orientation", kernel
+    for name, kernel in zip(STRESS_KERNELS, make_measure_stress(precision), strict=True):
+        yield name, "", kernel
     for variant, pairs in _pair_variants()[1:3]:
         yield "measure_pairs", variant, make_measure_pairs(precision, pairs)
     for variant in ("none", "closest"):

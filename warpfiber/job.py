@@ -21,6 +21,7 @@ import numpy as np
 
 from warpfiber.output.checkpoint import write_checkpoint
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.saved_stage import write_saved_stage
 from warpfiber.recording import Recording
 from warpfiber.restart import read_restart
 from warpfiber.scene import Fault, Scene, SceneError, Stage
@@ -44,7 +45,7 @@ class Job:
         self.progress = progress
         self.stages = self.scene.stage_sequence
         self.stage_index = 0
-        self.stage_start = (0.0, 0.0)  # strain and time where the stage began
+        self.stage_start = simulation.origin  # strain and time where the stage began
         self.row_index = 0
         self.frame_index = 0
         self.fresh = True  # the row and the frame of the start are still to be written
@@ -110,7 +111,7 @@ class Job:
         job = cls(simulation, folder, progress=progress)
         job.scene = dataclasses.replace(simulation.scene, fibers=restart.fibers)
         job.fresh = False
-        job.summary.restore(attrs["last_row"], attrs["half_turns"])
+        job.summary.restore(attrs["last_row"], attrs["half_turns"], attrs["stage_results"])
         job.stage_index = int(attrs["stage_index"])
         job.stage_start = (float(attrs["stage_strain"]), float(attrs["stage_time"]))
         if job.stage_index < len(job.stages):
@@ -212,8 +213,8 @@ class Job:
         return 0
 
     def _steps_to_events(self, stage: Stage) -> list[int]:
-        row = self._event_mark(stage, self.row_index + 1, self._row_interval(stage))
-        frame = self._event_mark(stage, self.frame_index + 1, self._frame_interval(stage))
+        row = self._event_mark(stage, self.row_index + 1, self.record.row_interval(stage))
+        frame = self._event_mark(stage, self.frame_index + 1, self.record.frame_interval(stage))
         steps_to = self.simulation.steps_to
         end = self.simulation.stage_steps(stage, self.stage_start)
         limit = self.simulation.steps_to_limit(stage, self.stage_start)
@@ -227,30 +228,14 @@ class Job:
             return self.stage_start[0] + index * width, None
         return None, self.stage_start[1] + index * width
 
-    def _row_interval(self, stage: Stage) -> tuple[str, float]:
-        return self._share(stage, self.scene.record.scalars)
-
-    def _frame_interval(self, stage: Stage) -> tuple[str, float]:
-        record = self.scene.record
-        if record.every_strain is not None:
-            return "strain", record.every_strain
-        if record.every_time is not None:
-            return "time", record.every_time
-        return self._share(stage, record.frames or 100)
-
-    def _share(self, stage: Stage, count: int) -> tuple[str, float]:
-        """`count` even parts of the whole run, in strain where the stages end by strain."""
-        flow = self.scene.flow
-        if stage.end_strain is not None and flow is not None and flow.rate > 0.0:
-            ends = [s.end_strain for s in self.stages]
-            return "strain", sum(e for e in ends if e is not None) / count
-        times = [s.end_time or s.time_limit for s in self.stages]
-        return "time", sum(t for t in times if t is not None) / count
-
     def _end_stage(self, stage: Stage) -> None:
         strain, seconds = self.simulation.strain, self.simulation.time
         where = f"strain {strain:.6g}" if self.scene.flow else f"time {seconds:.6g} s"
         self.folder.log(f"stage '{stage.name}' ended at {where}")
+        self.summary.end_stage(stage.name, self.simulation.method.stage_result(stage))
+        if stage.save:
+            arrays, attrs = self._saved_state(self.simulation.snapshot(), {"stage": stage.name})
+            write_saved_stage(self.folder.path, stage.name, arrays, attrs)
         self.stage_index += 1
         self.stage_start = (self.simulation.strain, self.simulation.time)
         self.row_index = self.frame_index = 0
@@ -278,8 +263,8 @@ class Job:
         stage = self.stages[self.stage_index]
         begin = time.perf_counter()
         first, self.fresh = self.fresh, False
-        row_index = self._reached(stage, self.row_index, self._row_interval(stage))
-        frame_index = self._reached(stage, self.frame_index, self._frame_interval(stage))
+        row_index = self._reached(stage, self.row_index, self.record.row_interval(stage))
+        frame_index = self._reached(stage, self.frame_index, self.record.frame_interval(stage))
         step, record = simulation.step_count, self.record
         row_due = first or row_index > self.row_index or (last and record.row_step < step)
         if row_due:
@@ -341,6 +326,7 @@ class Job:
             "last_row": self.record.last_row,
             "frame_step": self.record.frame_step,
             "half_turns": list(self.summary.half_turns),
+            "stage_results": list(self.summary.stage_results),
         }
 
     def _keep_good(self) -> None:
@@ -350,13 +336,19 @@ class Job:
             self.good, self.good_attrs = arrays, self._position()
 
     def _write_checkpoint(self, arrays: dict[str, np.ndarray], position: dict[str, Any]) -> Path:
+        arrays, attrs = self._saved_state(arrays, position)
+        self.summary.checkpoint_time = time.perf_counter()
+        return write_checkpoint(self.folder.path, int(arrays["step"][0]), arrays, attrs)
+
+    def _saved_state(
+        self, arrays: dict[str, np.ndarray], position: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and attributes of a state with what is needed to build its simulation again."""
         start, group = self.simulation.fiber_node_start, self.simulation.model.host["fiber_group"]
-        attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
         length = np.asarray(self.simulation.model.units.length)
         layout = {"fiber_node_start": start, "fiber_group": group, "length": length}
-        self.summary.checkpoint_time = time.perf_counter()
-        step = int(arrays["step"][0])
-        return write_checkpoint(self.folder.path, step, arrays | layout, attrs)
+        attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
+        return arrays | layout, attrs
 
     def _checkpoint_if_due(self) -> None:
         due = self.scene.record.checkpoint_every

@@ -21,10 +21,13 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
+from warpfiber.output.saved_stage import merged_arrays, read_saved_stage
+from warpfiber.passes.layer_profile import LayerProfile
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import Fault, Scene, SceneError, Stage
+from warpfiber.scene.derived import group_volume
 
 CUDA_BREAK_EVEN = 20_000  # segments from which `auto` prefers a CUDA device
 
@@ -128,9 +131,13 @@ class Simulation:
         stable.
         """
         scene = split_tables(with_device(scene, device))
+        saved = None
         if placement is None:
             preflight(scene)
-            placement = place_fibers(scene)
+            if scene.start is None:
+                placement = place_fibers(scene)
+            else:
+                saved, placement = read_saved_stage(scene)
         self.scene = realized_scene(scene, placement)
         self.limits = step_limits(self.scene)
         self.dt = check_step(self.scene)[0] if dt is None else dt
@@ -152,13 +159,26 @@ class Simulation:
             self.method.decay,
             self.method.inertia,
         )
+        self.layers: LayerProfile | None = None
+        if self.scene.record.layers:
+            self.layers = LayerProfile(
+                self.model,
+                self.state,
+                self.scene.record.layers,
+                [group_volume(self.scene, group) for group in self.scene.fibers],
+                "orientation4" in self.scene.record.quantities,
+            )
+        if saved is not None:
+            self.restore(merged_arrays(saved, self.snapshot()))
+        self.origin = (self.strain, self.time)  # where the first stage begins; s
         self.begin_stage(self.scene.stage_sequence[0])
 
     # -- stepping ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Compile everything that the run needs and build the first list."""
-        self.method.prepare(self.measurement.kernels(self.method.list))
+        layers = [self.layers.kernel] if self.layers is not None else []
+        self.method.prepare([*self.measurement.kernels(self.method.list), *layers])
 
     def step(self, count: int = 1) -> None:
         """Advance `count` steps of dt.
@@ -189,7 +209,7 @@ class Simulation:
             while (steps := self.steps_to(until, time)) > 0:
                 self.step(steps)
             return
-        start = (0.0, 0.0)
+        start = self.origin
         for stage in self.scene.stage_sequence:
             self.begin_stage(stage)
             while (steps := self.stage_steps(stage, start)) > 0:
@@ -316,8 +336,16 @@ class Simulation:
     def measure(self) -> dict[str, float]:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
         self.prepare()
+        self.measurement.counted = self.method.counted_fibers
         row = {"step": self.step_count, "time": self.time, "strain": self.strain}
         return row | self.measurement.row(self.method.list) | self.method.measure()
+
+    def measure_layers(self) -> dict[str, np.ndarray]:
+        """What each of `record.layers` holds, SI: z_low, z_high and the columns of LayerProfile."""
+        if self.layers is None:
+            return {}
+        edges = self.layers.edges()
+        return {"z_low": edges[:-1], "z_high": edges[1:]} | self.layers.measure()
 
     # -- saving -----------------------------------------------------------------------------------
 

@@ -37,6 +37,7 @@ class Summary:
         self.profiled_steps = 0
         self.failure: dict[str, Any] | None = None
         self.half_turns: list[float] = []
+        self.stage_results: list[dict[str, Any]] = []
         self._last: dict[str, float] = {}
 
     def begin(self) -> None:
@@ -67,9 +68,20 @@ class Summary:
         """Wall time of the run so far, earlier parts of a resumed run included."""
         return self.wall_before + time.perf_counter() - self.started
 
-    def restore(self, last_row: dict[str, float], half_turns: list[float]) -> None:
-        """Go on looking for half turns where the stopped run left off."""
+    def restore(
+        self,
+        last_row: dict[str, float],
+        half_turns: list[float],
+        stage_results: list[dict[str, Any]],
+    ) -> None:
+        """Go on looking for half turns where the stopped run left off; keep what stages showed."""
         self._last, self.half_turns = last_row, list(half_turns)
+        self.stage_results = list(stage_results)
+
+    def end_stage(self, name: str, result: dict[str, float]) -> None:
+        """Keep what a stage has shown, if anything."""
+        if result:
+            self.stage_results.append({"stage": name, **result})
 
     def look_at(self, row: dict[str, float]) -> None:
         """Find the strains at which the mean end-to-end angle passes -k pi (half turns)."""
@@ -139,6 +151,8 @@ class Summary:
                 if len(self.half_turns) > 1:
                     second = self.half_turns[1] - first
                     result["period_from_second_half_turn"] = 2.0 * second / flow.rate
+        if self.stage_results:
+            result["stages"] = self.stage_results
         if self.failure is not None:
             result["failure"] = self.failure
         return result

@@ -108,7 +108,9 @@ def heap(
     """Eight crossed layers of one or two fibers; without weight unless `keys` say so."""
     rods = []
     for k in range(8):
-        rod = level(RADIUS + 2.0 * RADIUS * k, 3 + k % 3, 1.0 * k, damping=0.0335 * (damping > 0))
+        rod = level(
+            RADIUS + 2.0 * RADIUS * k, 3 + 2 * (k % 2), 1.0 * k, damping=0.0335 * (damping > 0)
+        )
         rods.append(rod)
     numerics = keys.pop("numerics", {})
     return start_rods(
@@ -158,7 +160,7 @@ def test_work_is_energy(fraction: float) -> None:
 def test_no_energy_beyond_the_work(damping: float) -> None:
     """A bed pressed at 1 m/s with friction 1.4 and let go has 0.1 % more than the work at most.
 
-    Energy stored in contacts of fibers is not measured, so it can only be missing.
+    They cross between nodes; at a kink of a bent fiber it is up to 2 %, see `contact_energy`.
     """
     sim = heap(
         stages=[
@@ -266,11 +268,11 @@ def test_cycles_of_a_bed(tmp_path: Path) -> None:
     ]
     assert len(ends) == 5
     row = columns(tmp_path / "whole")
-    settled = int(np.searchsorted(row["time"], ends[0] - 1e-9))
+    settled = int(np.searchsorted(row["time"], ends[0] - 1e-6))  # told to six digits
     mass = 20.0 * ref.Rod(level(0.0, 5).rest, RADIUS, caps="capsule").mass.sum()
     assert row["pressure_low"][settled] == pytest.approx(mass * 9.81 / 0.02**2, rel=0.02)
     assert row["pressure_high"][settled] == 0.0 and row["wall_work"][settled] == 0.0
-    pressed = int(np.searchsorted(row["time"], ends[1] - 1e-9))
+    pressed = int(np.searchsorted(row["time"], ends[1] - 1e-6))
     assert row["pressure_high"][pressed] > 100.0
     assert press_of(whole.simulation).push.numpy()[0, 1] == 0.0  # where the last stage ended
 

@@ -5,7 +5,8 @@ Source: elliptic Hertz contacts from the sum of two curvature tensors; along a l
     shares of minima in the hollow of a kink; Mindlin and Coulomb. Written with eigenvalues and
     numerical integrals, where the kernels have closed forms.
 Symbols: x, v, w nodes of both fibers; s, t parts of the two segments; n from the first to the
-    second; a memory is (displacement, stiffness a step ago).
+    second; a memory is (displacement, overlap a step ago), and goes over to the next segment with
+    the contact.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from tests.reference.bonded_spheres import Array, Rod
 from tests.reference.segments import closest_points
 
 NEAR = 1e-9
+Memory = tuple[Array, float]
+Memories = dict[tuple[int, int], Memory]
 
 
 @dataclass
@@ -30,7 +33,8 @@ class Laws:
     poisson: float = 0.5
     damping: float = 0.0
     friction: float = 0.0
-    memories: dict[tuple[int, int], tuple[Array, float]] = field(default_factory=dict)
+    clamp: bool = True  # contacts never pull
+    memories: Memories = field(default_factory=dict)
 
     @property
     def effective(self) -> float:
@@ -69,6 +73,7 @@ class Touch:
     stiffness: float
     s: float
     t: float
+    depth: float = 0.0
 
 
 def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: float) -> Touch | None:
@@ -115,11 +120,15 @@ def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: floa
     per_integral = hertz(laws, [curvature(ra, 0.0), curvature(rb, angle)], depth)[0] / whole
     place = float(weights @ (overlap * z)) / integral
     t = (place - delta @ middle) / (b @ middle)
+    edge = gap(float(a @ middle)) - zero  # deepest along a, and a length of it further on each side
+    part = -(zero @ edge) / max(float(edge @ edge), 1e-30)
+    nearest = zero + min(max(float(part), -1.0), 2.0) * edge
     return Touch(
         per_integral * integral,
         per_integral * (high - low),
         place / float(a @ middle),
         min(max(t, 0.0), 1.0),
+        reach - float(np.linalg.norm(nearest)),
     )
 
 
@@ -178,7 +187,23 @@ def touch(laws: Laws, x: Array, i: int, j: int, rods: tuple[Rod, Rod]) -> Touch 
     force, stiffness = part * force, part * stiffness
     if line is not None and line.force >= force:
         return line
-    return Touch(force, stiffness, s, t)
+    return Touch(force, stiffness, s, t, depth)
+
+
+def memory(laws: Laws, before: Memories, i: int, j: int, found: Touch, x: Array) -> Memory:
+    """This pair's of a step ago, or the nearest of those that the contact can have come from."""
+    if (i, j) in before:
+        return before[(i, j)]
+    on_i, on_j = (k + (1 if part >= 0.5 else -1) for k, part in ((i, found.s), (j, found.t)))
+    far = [
+        min(part, 1.0 - part) * np.linalg.norm(x[k + 1] - x[k])
+        for k, part in ((i, found.s), (j, found.t))
+    ]
+    beside = [(on_i, j), (i, on_j)]
+    for key in [*(beside if far[0] <= far[1] else beside[::-1]), (on_i, on_j)]:
+        if key in before:
+            return before[key]
+    return np.zeros(3), 0.0
 
 
 def contact_loads(
@@ -188,9 +213,9 @@ def contact_loads(
     forces, moments = np.zeros_like(x), np.zeros_like(x)
     count = len(rods[0].rest)
     mass = np.concatenate([rods[0].mass, rods[1].mass])
+    earlier, laws.memories = laws.memories, {}
     for i, j in itertools.product(range(count - 1), range(count, len(x) - 1)):
         found = touch(laws, x, i, j, rods)
-        before = laws.memories.pop((i, j), (np.zeros(3), 0.0))
         if found is None:
             continue
         weights = (np.array([1.0 - found.s, found.s]), np.array([1.0 - found.t, found.t]))
@@ -209,17 +234,18 @@ def contact_loads(
         slip = speeds[0] - speeds[1]
         damper = 2.0 * math.sqrt(5.0 / 6.0) * laws.damping
         resistance = damper * math.sqrt(found.stiffness / softness)
-        size = max(found.force + resistance * float(slip @ n), 0.0)
+        size = found.force + resistance * float(slip @ n)
+        size = max(size, 0.0) if laws.clamp else size
         force = -size * n
         if laws.friction > 0.0:
             stiffness = laws.shear_ratio * found.stiffness
-            h, old = before
+            h, old = memory(laws, earlier, i, j, found, x)
             if old > 0.0:
                 length = np.linalg.norm(h)
                 h = h - (h @ n) * n
                 h = h + 0.5 * dt * float((spins[0] + spins[1]) @ n) * np.cross(n, h)
                 h = h * (length / max(float(np.linalg.norm(h)), 1e-30))
-                h = h * min(1.0, stiffness / old)
+                h = h * min(1.0, math.sqrt(old / found.depth))
             slide = slip - (slip @ n) * n
             h = h + dt * slide
             drag = -stiffness * h - damper * math.sqrt(stiffness / softness) * slide
@@ -227,7 +253,7 @@ def contact_loads(
             if np.linalg.norm(drag) > most:
                 drag = drag * (most / np.linalg.norm(drag))
                 h = -drag / stiffness
-            laws.memories[(i, j)] = (h, stiffness)
+            laws.memories[(i, j)] = (h, found.depth)
             force = force + drag
         for side, sign in ((0, 1.0), (1, -1.0)):
             couple = np.cross(levers[side], sign * force)

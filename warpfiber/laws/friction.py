@@ -1,11 +1,11 @@
 """Tangential force of a contact: an elastic memory of its path, limited by Coulomb's law.
 
 Source: Mindlin without partial slip, k_t = 8 G* sqrt(R* delta); the memory is kept in the plane of
-    the contact, turns with the mean spin about the normal and shrinks where the contact unloads
-    (Thornton, Cummins & Cleary 2013: else energy is created). Sliding leaves the memory at the
-    limit.
-Symbols: h elastic displacement of this side against the other, k its stiffness a step ago (0: no
-    contact then), n normal, v tangential velocity of this side against the other.
+    the contact and turns with the mean spin about the normal. A contact that is pressed deeper
+    keeps its force, one that unloads its displacement, so that no energy is created (Thornton,
+    Cummins & Cleary 2013). Sliding leaves the memory at the limit.
+Symbols: h elastic displacement of this side against the other, d overlap (k_t goes with its root),
+    n normal, v tangential velocity of this side against the other.
 """
 
 from functools import cache
@@ -24,16 +24,16 @@ def make_friction(name):
     tiny = real(1.0e-30)
 
     @wp.func
-    def carried_memory(h: vec3, k_before: real, k: real, n: vec3, turn: real) -> vec3:
-        """h in the present plane, turned by `turn` (rad, small) about n."""
-        if k_before <= zero:
+    def carried_memory(h: vec3, d_before: real, d: real, n: vec3, turn: real) -> vec3:
+        """h in the present plane, turned by `turn` (rad, small) about n; 0 without d_before."""
+        if d_before <= zero:
             return vec3(zero, zero, zero)
         size = wp.length(h)
         flat = h - wp.dot(h, n) * n
         flat += turn * wp.cross(n, flat)
         flat = (size / wp.max(wp.length(flat), tiny)) * flat
-        if k < k_before:
-            flat *= k / k_before
+        if d > d_before:
+            flat *= wp.sqrt(d_before / d)
         return flat
 
     @wp.func

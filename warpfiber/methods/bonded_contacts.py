@@ -14,7 +14,8 @@ import warp as wp
 
 from warpfiber.methods.pair_search import PairSearch
 from warpfiber.model import Model, State
-from warpfiber.passes.capsule_pairs import CapsuleFeatures, carry_memories, make_carry_memory
+from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.contact_memory import NEVER, carry_memories, make_carry_memory
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
 
@@ -44,8 +45,8 @@ class BondedContacts:
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
         kept = size if self.features.friction else 0
-        self.memory = wp.zeros(kept, dtype=p.vec3, device=device)
-        self.stiffness = wp.zeros(kept, dtype=p.real, device=device)
+        self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
+        self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)
 
     def kernels(self) -> list[Any]:
         """What a build launches."""
@@ -57,7 +58,7 @@ class BondedContacts:
         return [pairs.out_start, pairs.pair_j, pairs.pair_image, *self._memories()]
 
     def _memories(self) -> list[Any]:
-        return [self.acts, self.memory, self.stiffness]
+        return [self.acts, self.memory, self.written]
 
     def build(self, step: int) -> bool:
         """Build the list now and take the memories over; True if arrays were replaced."""
@@ -69,7 +70,8 @@ class BondedContacts:
         if carries:
             model = self.model
             after = self._listed()
-            carry_memories(model.precision.name, model.segment_count, before, after, model.device)
+            name, segments = model.precision.name, model.segment_count
+            carry_memories(name, segments, self.state.step, before, after, model.device)
         else:
             self.acts.zero_()
         return replaced
@@ -83,8 +85,9 @@ class BondedContacts:
         count = self.search.list.pair_count
         arrays = self.search.saved() | {"contact_acts": self.acts.numpy()[:count].copy()}
         if self.features.friction:
-            arrays["contact_memory"] = self.memory.numpy()[:count].copy()
-            arrays["contact_stiffness"] = self.stiffness.numpy()[:count].copy()
+            side = int(self.state.step.numpy()[0]) % 2
+            arrays["contact_memory"] = self.memory.numpy()[side, :count].copy()
+            arrays["contact_written"] = self.written.numpy()[side, :count].copy()
         return arrays
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
@@ -94,5 +97,6 @@ class BondedContacts:
         count = self.search.list.pair_count
         self.acts[:count].assign(arrays["contact_acts"])
         if self.features.friction:
-            self.memory[:count].assign(arrays["contact_memory"])
-            self.stiffness[:count].assign(arrays["contact_stiffness"])
+            side = step % 2
+            self.memory[side, :count].assign(arrays["contact_memory"])
+            self.written[side, :count].assign(arrays["contact_written"])

@@ -11,49 +11,41 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
+    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
     pair_launch,
 )
-from warpfiber.methods.loads import node_loads
+from warpfiber.methods.energies import Energies
 from warpfiber.methods.method import Method
-from warpfiber.methods.press import Press
 from warpfiber.model import EXPIRED, TORN, Model, State
-from warpfiber.passes import held_nodes
-from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.bonds import (
-    CLAMPED,
-    END_SPEED,
-    FREE,
-    HELD,
-    SETTLING,
-    STAGE_SIZE,
-    BondFeatures,
-)
-from warpfiber.passes.executor import Call, Executor, Launch, Repeat
+from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
+from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
+from warpfiber.passes.native_bonds import native_bonds_apply
+from warpfiber.passes.native_bonds_source import LOADS
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
-from warpfiber.scene.pressing import PRESSING
+from warpfiber.scene.gripping import GRIPPING
 
-STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
+NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
     "bond_axis bond_length node_turn node_spin node_rate node_spin_rate still_steps place "
-    "wall_memory wall_stiffness"
+    "wall_memory wall_depth"
 ).split()
 
 
@@ -68,15 +60,17 @@ class BondedSpheres(Method):
         super().__init__(scene, model, state, dt, workers)
         p, device, nodes = model.precision, model.device, model.node_count
         self.started = False
-        self.press = Press(scene, model, state, self.dt)
+        self.bed = BedStages(self)
+        self.press, self.grips, self.holds = self.bed.press, self.bed.grips, self.bed.holds
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
-            loads=bool(scene.loads) or any(group.frozen for group in scene.fibers),
+            loads=self.holds.used,
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
             wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
             press=self.press.axis,
+            grips=self.grips.used,
         )
         self.groups = wp.array(
             [self._group(group) for group in scene.fibers],
@@ -86,9 +80,6 @@ class BondedSpheres(Method):
         axis, length = self._stress_free()
         self.bond_axis = wp.array(axis.astype(p.numpy), dtype=p.vec3, device=device)
         self.bond_length = wp.array(length.astype(p.numpy), dtype=p.real, device=device)
-        hold, load = self._loads()
-        self.node_hold = wp.array(hold, dtype=wp.int32, device=device)
-        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], dtype=p.numpy), (nodes, 1))
         self.node_turn = wp.array(identity, dtype=p.vec4, device=device)
         self.node_spin = wp.zeros(nodes, dtype=p.vec3, device=device)
@@ -97,9 +88,8 @@ class BondedSpheres(Method):
         self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
         kept = SIDES * nodes if self.features.wall_friction else 0
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
-        self.wall_stiffness = wp.zeros(kept, dtype=p.real, device=device)
+        self.wall_depth = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
-        self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
         # float64 in every precision: world positions in float32 lose slow motion
         self.place = state.node_pos
         if p.name == "float32":
@@ -110,6 +100,10 @@ class BondedSpheres(Method):
             self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
+        self.native: NativeBonds | None = None
+        if NATIVE and native_bonds_apply(model, self.features):
+            self.native = NativeBonds(self)
+        self.energies = Energies(self)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -150,31 +144,12 @@ class BondedSpheres(Method):
         length = np.linalg.norm(chord, axis=1)
         return chord / length[:, None], length
 
-    def _loads(self) -> tuple[np.ndarray, np.ndarray]:
-        """How every node is held, and its force, or its velocity where it is held.
-
-        A clamp holds one node and its orientation: that is its segment's at this end.
-        """
-        scene, model = self.scene, self.model
-        imposed, load = node_loads(scene, model)
-        hold = np.full(len(imposed), FREE, dtype=np.int32)
-        hold[imposed == held_nodes.HELD] = HELD
-        hold[imposed == held_nodes.FROZEN] = CLAMPED
-        start, group = model.host["fiber_node_start"], model.host["fiber_group"]
-        for row in scene.loads:
-            if row.hold == "clamp" and not scene.fibers[row.group].frozen:
-                fiber = np.flatnonzero(group == row.group)[row.fiber]
-                nodes = np.arange(start[fiber], start[fiber + 1])
-                clamped = nodes[row.node]
-                other = clamped + 1 if clamped < nodes[-1] else clamped - 1
-                hold[clamped], hold[other], load[other] = CLAMPED, FREE, 0.0
-        return hold, load
-
     # -- the step ---------------------------------------------------------------------------------
 
     def launches(self) -> list[Launch | Call | Repeat]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
-        begin, end = [clock_launch(self), *self.press.motion()], self.press.meter()
+        begin = [clock_launch(self), *self.press.motion()]
+        end = [*self.press.meter(), *self.grips.meter(), *self.energies.losses()]
         if self.contacts is None:
             return [*begin, bond_launch(self, drifts=True, kicks=True), *end]
         return [
@@ -186,6 +161,11 @@ class BondedSpheres(Method):
         ]
 
     @property
+    def counted_fibers(self) -> int:
+        """Those that are poured; at least one, so that there is something to measure."""
+        return max(1, self.bed.pour.count)
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units; with the start skin."""
         return self.contacts.search.box_width if self.contacts is not None else 0.0
@@ -193,25 +173,37 @@ class BondedSpheres(Method):
     def prepare(self, measuring: Iterable[Any] = ()) -> None:
         """Compile and capture; find the accelerations of the start."""
         kernels = list(measuring)
-        if self.executor is None and "energy" in self.scene.record.quantities:
-            kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
+        if self.executor is None:
+            kernels += self.energies.kernels()
         if self.contacts is not None:
             kernels += self.contacts.kernels()
-        super().prepare(kernels)
+        self._prepare_steps(kernels)
         if self.started:
             return
         self.started = True
         if self.place is not self.state.node_pos:
             self.place.assign(self.state.node_pos.numpy().astype(float))
-        first: list[Launch | Call | Repeat] = [bond_launch(self, drifts=False, kicks=False)]
+        first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
             if self.contacts.build(self.step_count):
                 self._stop_executor()
-                super().prepare()  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), bond_launch(self, drifts=False, kicks=False)]
+                self._prepare_steps([])  # a list that grew has other arrays
+            first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
+
+    def _prepare_steps(self, kernels: list[Any]) -> None:
+        if self.executor is None and self.native is not None:
+            load_kernels([*self.native.kernels(), *kernels], self.model.device)
+            self.executor = self.native.steps(self._halted)
+        super().prepare(kernels)
+
+    def _rates(self) -> Launch:
+        """Accelerations of the start."""
+        if self.native is not None:
+            return self.native.launch(LOADS)
+        return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
         """Build the list anew if it has expired; False if a fiber tore."""
@@ -228,6 +220,11 @@ class BondedSpheres(Method):
             self.list_seconds = self.contacts.search.seconds
         return True
 
+    def rebuild_list(self) -> None:
+        """List the pairs of the present positions: some node was set elsewhere."""
+        if self.contacts is not None and self.contacts.build(self.step_count):
+            self._stop_executor()
+
     def list_report(self) -> dict[str, float]:
         """What the search for pairs did; nothing without a list."""
         return self.contacts.search.report(self.step_count) if self.contacts is not None else {}
@@ -238,79 +235,60 @@ class BondedSpheres(Method):
         if self.contacts is not None:
             self.contacts.search.close()
 
+    # -- stages -----------------------------------------------------------------------------------
+
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
-        """Take over the damping of a stage; count anew how long all nodes have been still."""
+        """Take over the damping of a stage and what it does to the bed."""
         units = self.model.units
         numbers = np.zeros(STAGE_SIZE, dtype=self.model.precision.numpy)
         numbers[SETTLING] = stage.damping * units.time
         numbers[END_SPEED] = ((stage.end_speed or 0.0) / units.velocity) ** 2
         self.stage.assign(numbers)
-        if not resumed:
-            self.still_steps.zero_()
-            nodes = self.place if self.started else self.state.node_pos
-            self.press.begin(stage, nodes.numpy().astype(float))
+        self.bed.begin_stage(stage, resumed=resumed)
+
+    def advance(self, steps: int) -> bool:
+        """Run `steps` steps, with a stop wherever fibers are due to be poured."""
+        target = self.step_count + steps
+        while (step := self.step_count) < target:
+            self.bed.pour_due(step)
+            if not super().advance(min(target - step, self.bed.pour.steps_left(step))):
+                return False
+        return True
+
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """As of every method; nothing while fibers are poured, which is between steps."""
+        return {} if self.bed.pour.waits else super().time_passes(steps)
 
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which no condition but strain and time surely ends the stage."""
-        if stage.kind in PRESSING:
-            return self.press.steps_left(stage, self.step_count)
-        if stage.end_speed is None:
-            return None
-        return max(0, self.still_needed - int(self.still_steps.numpy().min()))
+        return self.bed.steps_left(stage)
+
+    def stage_result(self, stage: Stage) -> dict[str, float]:
+        """Yield stress of a bed that is pulled or sheared."""
+        return self.grips.result() if stage.kind in GRIPPING else {}
 
     def unmet(self, stage: Stage) -> str:
         """What the stage still waits for."""
-        if stage.kind in PRESSING:
-            return self.press.unmet(stage)
-        if stage.end_speed is None:
-            return ""
-        velocity = self.state.node_velocity.numpy().astype(float)
-        fastest = float(np.linalg.norm(velocity, axis=1).max()) * self.model.units.velocity
-        return f"end_speed = {stage.end_speed:g} m/s; the fastest node moves at {fastest:.4g} m/s"
+        return self.bed.unmet(stage)
 
     # -- what is saved and told -------------------------------------------------------------------
 
     def measure(self) -> dict[str, float]:
         """Energies in J and what walls feel, where `record.quantities` asks for them."""
-        pressed = self.press.measure()
-        if "energy" not in self.scene.record.quantities:
-            return pressed
-        model, walls = self.model, self.features.walls
-        inputs = [
-            wp.vec3d(*self.press.corners.mean(axis=0)),
-            self.press.place,
-            self.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            self.bond_axis,
-            self.bond_length,
-            self.place,
-            self.state.node_velocity,
-            self.node_turn,
-            self.node_spin,
-        ]
-        found = measure_bond_energies(
-            model.precision.name, walls, model.fiber_count, inputs, model.device
-        )
-        absent = {"gravity"} if self.scene.gravity is None else set()
-        absent |= set() if any(walls) else {"wall"}
-        return pressed | {
-            f"energy_{name}": found[name] * model.units.energy
-            for name in ENERGIES
-            if name not in absent
-        }
+        return self.press.measure() | self.grips.measure() | self.energies.measure()
 
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
-        arrays |= self.press.saved()
+        arrays |= self.bed.saved() | self.energies.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"bonds_{name}"])
-        self.press.restore(arrays)
+        self.bed.restore(arrays)
+        self.energies.restore(arrays)
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)

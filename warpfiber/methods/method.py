@@ -134,7 +134,7 @@ class Method(ABC):
             assert self.executor is not None
             taken = self.step_count
             found = self.executor.time_step()
-            if self.step_count > taken:
+            if found is not None and self.step_count > taken:
                 times.append(found)
             # a torn fiber is left to the next `advance`
             if len(times) == steps or (self._halted() and not self._settle()):
@@ -162,6 +162,11 @@ class Method(ABC):
         return int(self.state.step.numpy()[0])
 
     @property
+    def counted_fibers(self) -> int:
+        """Fibers that are simulated now; measurements leave the later ones out."""
+        return self.model.fiber_count
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units."""
         return 0.0
@@ -183,6 +188,10 @@ class Method(ABC):
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which the method's own condition surely does not end it; None without."""
         return None
+
+    def stage_result(self, stage: Stage) -> dict[str, float]:
+        """What the whole stage under way has shown, SI; nothing for most."""
+        return {}
 
     def unmet(self, stage: Stage) -> str:
         """What that condition still waits for."""

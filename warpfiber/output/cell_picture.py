@@ -127,7 +127,7 @@ def _draw_tubes(
     depth = 0.5 * (depth0 + depth1)
     order = np.argsort(depth, kind="stable")
 
-    body = _direction_colors(axis)[fiber]
+    body = direction_colors(axis)[fiber]
     # Distant fibers fade toward the paper, which tells depth where nothing crosses.
     fog = 0.45 * np.clip((0.40 - depth) / 0.80, 0, 1)[:, None]
     detailed = len(begin) <= _DETAILED_PIECES
@@ -217,7 +217,7 @@ def _miters(along: Floats, joint: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     return begin, end
 
 
-def _direction_colors(axis: Floats) -> Floats:
+def direction_colors(axis: Floats) -> Floats:
     """Color (F, 3) of unit vectors (F, 3): the three axis colors mixed by p_x^2, p_y^2, p_z^2."""
     from matplotlib.colors import to_rgb
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpfiber.output.axes_style import GRAY, INK
 from warpfiber.output.cell_picture import AXIS_COLORS
 
-INK, GRAY = "#22262b", "#6b7280"
 BLUE, ORANGE, GREEN, PURPLE = "#2f6db5", "#d97b29", "#2a9d6f", "#8458a8"
 RED = "#c0445a"
 
@@ -34,11 +34,22 @@ FIGURES = (
     Curves(
         "orientation",
         "Orientation tensor",
-        "orientation tensor component",
+        "component, weighted by length",
         {
             "a11": ("$a_{11}$  flow", AXIS_COLORS[0]),
             "a22": ("$a_{22}$  vorticity", AXIS_COLORS[1]),
             "a33": ("$a_{33}$  gradient", AXIS_COLORS[2]),
+        },
+        ylim=(0.0, 1.0),
+    ),
+    Curves(
+        "orientation_number",
+        "Orientation tensor",
+        "component, one vote per fiber",
+        {
+            "a11_fiber": ("$a_{11}$  flow", AXIS_COLORS[0]),
+            "a22_fiber": ("$a_{22}$  vorticity", AXIS_COLORS[1]),
+            "a33_fiber": ("$a_{33}$  gradient", AXIS_COLORS[2]),
         },
         ylim=(0.0, 1.0),
     ),
@@ -61,6 +72,32 @@ FIGURES = (
         ylim=(0.0, np.inf),
     ),
     Curves(
+        "bending",
+        "Bending",
+        "strain of the surface by bending",
+        {"bending_strain_max": ("largest", ORANGE), "bending_strain_mean": ("mean", BLUE)},
+        ylim=(0.0, np.inf),
+        least=1e-12,  # rods do not bend
+    ),
+    Curves(
+        "stress",
+        "Stress of the fibers",
+        "stress (Pa)",
+        {
+            "stress_13": ("shear", BLUE),
+            "stress_contact_13": ("of it contact", GREEN),
+            "normal_difference_1": ("$N_1$", ORANGE),
+            "normal_difference_2": ("$N_2$", PURPLE),
+        },
+    ),
+    Curves(
+        "viscosity",
+        "Relative viscosity",
+        "viscosity of the suspension / of the fluid",
+        {"relative_viscosity": ("", BLUE)},
+        ylim=(0.0, np.inf),
+    ),
+    Curves(
         "energy",
         "Energies",
         "energy (J)",
@@ -72,6 +109,7 @@ FIGURES = (
             "energy_twist": ("twist", INK),
             "energy_repulsion": ("repulsion", PURPLE),
             "energy_wall": ("walls", GRAY),
+            "energy_contact": ("contacts", PURPLE),
         },
         logarithmic=True,
     ),

@@ -1,8 +1,9 @@
 """ResultFolder: the folder of one run and its small text files.
 
-It holds `scene.json`, `log.txt`, `scalars.csv`, `summary.json`, `run.vtkhdf`,
-`checkpoint_<step>.h5`, `figures/` and `usd/`. A run never overwrites a folder unless it is told to,
-and even then it removes only what a run writes.
+It holds `scene.json`, `log.txt`, `scalars.csv`, `layers.csv`, `columns.csv` (what the columns of
+both are), `placement.csv`, `summary.json`, `run.vtkhdf`, `checkpoint_<step>.h5`, `figures/` and
+`usd/`. A run never overwrites a folder unless it is told to, and even then it removes only what a
+run writes.
 """
 
 from __future__ import annotations
@@ -19,10 +20,21 @@ from typing import Any
 from warpfiber.output.description import describe
 from warpfiber.output.record_error import RecordError
 from warpfiber.scene import Fault, SceneError
+from warpfiber.scene.starting import saved_stage_name, saved_stages
 
 __all__ = ["RecordError", "ResultFolder", "describe"]
 
-_FILES = ("scene.json", "log.txt", "scalars.csv", "summary.json", "run.vtkhdf", "diverged.npz")
+_FILES = (
+    "scene.json",
+    "log.txt",
+    "scalars.csv",
+    "layers.csv",
+    "columns.csv",
+    "placement.csv",
+    "summary.json",
+    "run.vtkhdf",
+    "diverged.npz",
+)
 _FOLDERS = ("figures", "usd")
 
 
@@ -99,6 +111,11 @@ class ResultFolder:
         """The table of measured numbers, `scalars.csv`."""
         return self.path / "scalars.csv"
 
+    @property
+    def layers_path(self) -> Path:
+        """What the layers of the box held at every frame, `layers.csv`."""
+        return self.path / "layers.csv"
+
     def write_scene(self, scene: Mapping[str, Any]) -> None:
         """Write the resolved scene as `scene.json`."""
         _write_json(self.path / "scene.json", scene)
@@ -114,6 +131,11 @@ class ResultFolder:
     def read_summary(self) -> dict[str, Any]:
         """The summary; empty if there is none. Raises RecordError if damaged."""
         return _read_json(self.path / "summary.json")
+
+    def write_fit(self, name: str, content: Mapping[str, Any]) -> Path:
+        """Write the constants of a fit as `<name>.json`; returns its path."""
+        _write_json(self.path / f"{name}.json", content)
+        return self.path / f"{name}.json"
 
     def log(self, line: str) -> None:
         """Append one line to `log.txt`, after the wall time since this folder was opened."""
@@ -136,10 +158,18 @@ def _make_numbered(wanted: Path) -> Path:
             path = wanted.with_name(f"{wanted.name}_{number}")
 
 
+def _written(folder: Path) -> list[Path]:
+    """Files that a run, or a fit of it, may have written."""
+    found = [folder / name for name in _FILES]
+    return [*found, *folder.glob("checkpoint_*.h5"), *folder.glob("fit_*.json")]
+
+
 def _remove_results(folder: Path) -> None:
     """Delete what a run writes, and nothing else that lies in the folder."""
-    for path in [*(folder / name for name in _FILES), *folder.glob("checkpoint_*.h5")]:
+    for path in _written(folder):
         path.unlink(missing_ok=True)
+    for name in saved_stages(folder):
+        (folder / saved_stage_name(name)).unlink()
     for name in _FOLDERS:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)

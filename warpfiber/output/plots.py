@@ -1,10 +1,12 @@
 """Figures of a run, drawn from its folder alone; each PNG lies beside a CSV with what it shows.
 
-Curves against strain (time, where nothing is strained): orientation, interactions, overlap, energy,
-pressure on walls, axial strain, angle, and the tip of a few fibers; `cell.png` is a picture of the
-cell at the end.
+Curves against strain (time, where nothing is strained): orientation by length and by number,
+interactions, overlap, bending, stress, energy, pressure on walls, axial strain, angle, and the tip
+of a few fibers; `cell.png` is a picture of the cell at the end. Where layers were recorded (in the
+first run) `layers*.png` go through the thickness and `cut.png` is a section there.
 Points of `reference/*.csv` beside the scene are drawn over them: a header row with `strain` (or
 `time`) and columns named as in `scalars.csv` (`tip` for the tip); lines with # are comments.
+So is the exact orientation of the fibers without contact, where it applies or is asked for.
 """
 
 from __future__ import annotations
@@ -18,9 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpfiber.output.axes_style import GRAY, INK, plain_axes
 from warpfiber.output.cell_picture import draw_cell
-from warpfiber.output.curves import BLUE, FIGURES, GRAY, GREEN, INK, ORANGE, PURPLE, Curves
+from warpfiber.output.curves import BLUE, FIGURES, GREEN, ORANGE, PURPLE, Curves
+from warpfiber.output.cut_picture import draw_cut
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.layer_figures import draw_layers
+from warpfiber.output.orientation_curve import exact_table, exact_without_contact
 from warpfiber.output.record_error import record_errors
 from warpfiber.output.scalars import read_scalars
 from warpfiber.output.trajectory import TrajectoryReader
@@ -47,29 +53,34 @@ class _Run:
     scene: Mapping[str, Any]
 
 
-def plot_run(folders: Any, out: str | Path | None = None) -> list[Path]:
+def plot_run(folders: Any, out: str | Path | None = None, exact: bool = False) -> list[Path]:
     """Draw all figures of one folder, or of several in the same axes; returns the PNG files.
 
     `folders`: path or ResultFolder, or a list of them. `out`: folder for the pictures, by default
-    `figures/` of the first run. A figure without data is left out. Raises SceneError if a folder
-    is missing, RecordError if a file is damaged or cannot be written.
+    `figures/` of the first run. A figure without data is left out. `exact`: draw the orientation
+    without contact also where fibers touch or bend. Raises SceneError if a folder is missing, or
+    has no exact orientation, RecordError if a file is damaged or cannot be written.
     """
     several = folders if isinstance(folders, (list, tuple)) else [folders]
     runs = [_read_run(folder) for folder in several]
     target = runs[0].folder.path / "figures" if out is None else Path(out)
     with record_errors(target, "make the folder"):
         target.mkdir(parents=True, exist_ok=True)
-    references = _references(runs[0])
+    references = _references(runs[0]) | _exact(runs[0], exact)
     written = []
     for curves in (*FIGURES, _tip_curves(runs)):
         path = target / f"{curves.name}.png"
         if _draw_curves(curves, runs, references, path):
             written.append(path)
+    written += draw_layers(runs[0].folder.layers_path, target, runs[0].scene, references)
     if runs[0].folder.trajectory_path.exists():
         with TrajectoryReader(runs[0].folder.trajectory_path) as reader:
             if reader.frame_count:
                 draw_cell(reader, target / "cell.png")
                 written.append(target / "cell.png")
+                layered = runs[0].folder.layers_path.exists()
+                if layered and draw_cut(reader, target / "cut.png"):
+                    written.append(target / "cut.png")
     return written
 
 
@@ -151,6 +162,13 @@ def _references(run: _Run) -> dict[str, Table]:
     return found
 
 
+def _exact(run: _Run, asked: bool) -> dict[str, Table]:
+    """The exact orientation without contact as one more table of points; may be empty."""
+    if not asked and not ("a11" in run.table and exact_without_contact(run.scene)):
+        return {}
+    return {"exact_without_contact": exact_table(run.folder)}
+
+
 def _known(curves: Curves, run: _Run) -> list[str]:
     """Columns of the figure that a run has."""
     return [name for name in curves.columns if _finite(run.table, name)]
@@ -219,7 +237,7 @@ def _draw_reference(
 ) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for k, (stem, table) in enumerate(references.items()):
-        if name in table and against in table:
+        if name in table and against in table and "z" not in table:
             marker = "osD^v"[k % 5]
             style: dict[str, Any] = {
                 "marker": marker,
@@ -257,13 +275,7 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
             fontsize=9,
             color=GRAY,
         )
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#9aa1ab")
-    axes.tick_params(which="both", color="#9aa1ab", labelcolor=GRAY, labelsize=9)
-    axes.grid(True, color="#e6e8eb", linewidth=0.8)
-    axes.set_axisbelow(True)
+    plain_axes(axes)
     axes.margins(x=0)
     if curves.logarithmic:
         axes.set_yscale("log")

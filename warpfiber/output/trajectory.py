@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from warpfiber.output.columns import column_meaning
 from warpfiber.output.record_error import RecordError, record_errors
 
 if TYPE_CHECKING:
@@ -40,11 +41,13 @@ class TrajectoryWriter:
         scene_json: str,
         attrs: Mapping[str, Any],
         node_fields: Sequence[str] = (),
+        layer_columns: Sequence[str] = (),
     ) -> None:
         """Start a record of F fibers: `fiber_node_start` (F+1), `fiber_group` (F).
 
         `attrs` (hash, version, device, precision, seed ...) become attributes of `/warpfiber`;
-        `node_fields` names what every `append` brings per node. Raises RecordError if refused.
+        `node_fields` names what every `append` brings per node, `layer_columns` the columns of its
+        value `layers` (layers, columns). Raises RecordError if refused.
         """
         import h5py
 
@@ -59,6 +62,9 @@ class TrajectoryWriter:
             own = file.create_group("warpfiber")
             own.attrs["scene"] = scene_json
             own.attrs["node_fields"] = json.dumps(list(node_fields))
+            if layer_columns:
+                meanings = {name: column_meaning(name) for name in layer_columns}
+                own.attrs["layer_columns"] = json.dumps(meanings)
             for name, value in attrs.items():
                 if value is not None:
                     own.attrs[name] = value
@@ -149,7 +155,10 @@ class TrajectoryWriter:
             _put(root, f"Steps/PointDataOffsets/{name}", k, np.array([k * nodes]))
         _put(root, "CellData/fiber_axis", k, axis.astype(np.float32))
         for name, value in per_frame.items():
-            _put(self._file["warpfiber"], name, k, value[None])
+            own = self._file["warpfiber"]
+            _put(own, name, k, value[None])
+            if k == 0:
+                _describe(own[name], name)
         steps = root["Steps"]
         _put(steps, "PointOffsets", k, np.array([k * nodes]))
         _put(steps, "PartOffsets", k, np.array([0]))
@@ -317,6 +326,13 @@ def _put(group: h5py.Group, name: str, frame: int, data: NDArray[Any]) -> None:
     dataset = group[name]
     dataset.resize((frame + 1) * len(data), axis=0)
     dataset[frame * len(data) :] = data
+
+
+def _describe(dataset: h5py.Dataset, column: str) -> None:
+    """Unit and meaning of a recorded value as attributes."""
+    for word, text in zip(("unit", "meaning"), column_meaning(column), strict=True):
+        if text:
+            dataset.attrs[word] = text
 
 
 def _frame_datasets(file: h5py.File) -> Iterator[tuple[h5py.Dataset, int]]:

@@ -19,7 +19,8 @@ from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.capsule_pairs import make_gather
 from warpfiber.passes.node_walls import make_node_walls
 
-FREE, HELD, CLAMPED = 0, 1, 2  # of a node: moves; moves as told; also does not turn
+# Of a node: moves; moves as told; also does not turn; the same in the lower and the upper grip.
+FREE, HELD, CLAMPED, LOWER, UPPER = range(5)
 SETTLING, END_SPEED = 0, 1  # slots of the stage's numbers: damping, squared speed of a still node
 STAGE_SIZE = 2
 
@@ -35,6 +36,7 @@ class BondFeatures:
     pairs: bool = False
     wall_friction: bool = False
     press: int = -1  # axis whose walls may move and are metered
+    grips: bool = False  # what acts on the nodes of grips is told; needs `loads`
 
 
 @cache
@@ -54,6 +56,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     has_walls, is_metered = any(features.walls), features.press >= 0
     has_dashpots, has_loads = features.dashpots, features.loads
     has_rings, has_pairs = features.closed, features.pairs
+    has_grips = features.grips
     is_single = name == "float32"
     zero, half, one = real(0.0), real(0.5), real(1.0)
 
@@ -112,6 +115,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         bond_length: wp.array(dtype=real),
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
+        node_grip: wp.array(dtype=vec3),
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
@@ -120,7 +124,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
         wall_memory: wp.array(dtype=vec3),
-        wall_stiffness: wp.array(dtype=real),
+        wall_depth: wp.array(dtype=real),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -210,6 +214,9 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
             if (i == first or i == last) and g.closed == 0:
                 mass = g.end_mass
                 inertia = g.end_inertia
+            if wp.static(has_grips):
+                if node_hold[i] >= wp.static(LOWER):
+                    node_grip[i] = force
             if wp.static(has_walls):
                 step = zero
                 if wp.static(kicks):
@@ -225,7 +232,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     wall_place,
                     wall_velocity,
                     wall_memory,
-                    wall_stiffness,
+                    wall_depth,
                 )
                 force += push
                 moment += couple
@@ -247,7 +254,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 if hold != wp.static(FREE):
                     rate = nothing
                     v = node_load[i]
-                if hold == wp.static(CLAMPED):
+                if hold >= wp.static(CLAMPED):
                     spin_rate = nothing
                     w = nothing
             node_rate[i] = rate

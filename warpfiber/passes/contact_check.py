@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.contact_verdict import make_contact_verdict
@@ -57,9 +58,10 @@ class ContactCheck:
         features = CheckFeatures(
             any(domain.periodic),
             domain.wall,
-            fiber_frozen is not None,
+            frozen=fiber_frozen is not None,
             shifted=len(solves) > 0,
             again=len(solves) > 1,
+            arrays=bool(domain.arrays),
         )
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))
@@ -93,6 +95,7 @@ class ContactCheck:
             p.real(widest),
             p.vec3(*low),
             p.vec3(*(low + np.asarray(domain.size))),
+            wall_arrays(model),
             model.groups,
             model.fiber_node_start,
             model.fiber_group,

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.neighbors import NeighborList
@@ -56,7 +57,9 @@ class ContactRows:
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         self.keep = keep
         domain = model.domain
-        self.features = RowFeatures(any(domain.periodic), domain.wall, lubrication)
+        self.features = RowFeatures(
+            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays)
+        )
         name, features = model.precision.name, self.features
         module = kernel_module("rows", name, features)
         self.kernels = dict(make_row_count(name, features, module))
@@ -181,7 +184,7 @@ class ContactRows:
     def _walls(self) -> list[Any]:
         vec3, domain = self.model.precision.vec3, self.model.domain
         low = np.asarray(domain.low)
-        return [vec3(*low), vec3(*(low + np.asarray(domain.size)))]
+        return [vec3(*low), vec3(*(low + np.asarray(domain.size))), wall_arrays(self.model)]
 
     def _fibers(self) -> list[Any]:
         model, pairs = self.model, self.pairs

@@ -3,7 +3,8 @@
 Every thread sums a fixed run of fibers or segments, the host adds the few partial sums in order:
 the result does not depend on the device's scheduling.
 
-Source: Advani & Tucker 1987 for A_ij = <p_i p_j>; segments are weighted by their length.
+Source: a_ij = <p_i p_j> and A_ijkl of segments weighted by their length, and of end-to-end vectors
+    with one vote per fiber.
 """
 
 from dataclasses import dataclass
@@ -20,9 +21,9 @@ from warpfiber.laws.torque import make_torque
 from warpfiber.model import precision
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
+from warpfiber.passes.tensor_sums import TENSOR, TENSOR4_NAMES, make_tensor_sums
 
 # Columns of the partial sums over fibers.
-TENSOR = ("a11", "a22", "a33", "a12", "a13", "a23")
 FIBER_SUMS = (
     "length",
     *TENSOR,
@@ -32,12 +33,11 @@ FIBER_SUMS = (
     "energy_bending",
     "curvature",
     "energy_wall",
+    "bending_strain",
 )
-FIBER_MAXIMA = ("axial_strain_max", "curvature_max")
-# The 15 different components of the symmetric fourth-order tensor.
-TENSOR4 = tuple(
-    (i, j, k, m) for i in range(3) for j in range(i, 3) for k in range(j, 3) for m in range(k, 3)
-)
+FIBER_MAXIMA = ("axial_strain_max", "curvature_max", "bending_strain_max")
+# Behind them with orientation4: by length, then one vote per fiber.
+FIBER_SUMS4 = (*TENSOR4_NAMES, *(f"{name}_fiber" for name in TENSOR4_NAMES))
 PAIR_SUMS = ("touching", "repelling", "lubricating", "overlap", "energy_repulsion")
 TERMS = ("stretching", "bending", "hydrodynamic torque", "contact", "drag")
 
@@ -56,7 +56,7 @@ class MeasureFeatures:
 
 @cache
 def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "unique"):
-    """Kernel: partial sums over fibers, columns FIBER_SUMS (+ TENSOR4) and FIBER_MAXIMA."""
+    """Kernel: partial sums over fibers, columns FIBER_SUMS (+ FIBER_SUMS4) and FIBER_MAXIMA."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
@@ -64,7 +64,9 @@ def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "uni
     has_energy, has_curvature = features.energy, features.curvature
     has_inertia = features.inertia
     has_tensor4 = features.orientation4
+    add_tensor, add_tensor4 = make_tensor_sums()
     first_tensor4 = len(FIBER_SUMS)
+    first_tensor4_fiber = first_tensor4 + len(TENSOR4_NAMES)
     wall_x, wall_y, wall_z = features.walls
     has_walls = features.energy and any(features.walls)
     _, repulsion_energy = make_repulsion(name)
@@ -93,37 +95,6 @@ def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "uni
                 energy += wall_energy(high[axis] - x[axis], radius, strength, decay)
         return energy
 
-    @wp.func
-    def add_tensor(
-        row: wp.int32,
-        first: wp.int32,
-        n: wp.vec3d,
-        w: wp.float64,
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        out[row, first + 0] = out[row, first + 0] + w * n[0] * n[0]
-        out[row, first + 1] = out[row, first + 1] + w * n[1] * n[1]
-        out[row, first + 2] = out[row, first + 2] + w * n[2] * n[2]
-        out[row, first + 3] = out[row, first + 3] + w * n[0] * n[1]
-        out[row, first + 4] = out[row, first + 4] + w * n[0] * n[2]
-        out[row, first + 5] = out[row, first + 5] + w * n[1] * n[2]
-
-    @wp.func
-    def add_tensor4(
-        row: wp.int32,
-        first: wp.int32,
-        n: wp.vec3d,
-        w: wp.float64,
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        column = first
-        for i in range(3):
-            for j in range(i, 3):
-                for k in range(j, 3):
-                    for m in range(k, 3):
-                        out[row, column] = out[row, column] + w * n[i] * n[j] * n[k] * n[m]
-                        column += 1
-
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def measure_fibers(
         chunks: wp.int32,
@@ -150,6 +121,8 @@ def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "uni
             rest = wp.float64(g.rest)
             axis = wp.normalize(wp.vec3d(node_pos[first + g.segments] - node_pos[first]))
             add_tensor(chunk, 7, axis, wp.float64(1.0), sums_out)
+            if wp.static(has_tensor4):
+                add_tensor4(chunk, wp.static(first_tensor4_fiber), axis, wp.float64(1.0), sums_out)
             if wp.static(has_walls):
                 for i in range(first, first + g.segments + 1):
                     sums_out[chunk, 17] = sums_out[chunk, 17] + walls_energy(
@@ -198,8 +171,11 @@ def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "uni
                             sums_out[chunk, 15] + half * wp.float64(g.bending) * bent
                         )
                         curvature = angle / rest
+                        surface = wp.float64(g.radius) * curvature
                         sums_out[chunk, 16] = sums_out[chunk, 16] + curvature * rest
+                        sums_out[chunk, 18] = sums_out[chunk, 18] + surface * rest
                         maxima_out[chunk, 1] = wp.max(maxima_out[chunk, 1], curvature)
+                        maxima_out[chunk, 2] = wp.max(maxima_out[chunk, 2], surface)
                     n0 = n1
                 edge0 = edge
 

@@ -1,9 +1,10 @@
 """Host side of the measurements: launches the reductions a scene asks for, adds their sums.
 
-Definitions: orientation tensors A_ij = <p_i p_j> of segments (weighted by length) and of end-to-end
-vectors; an interaction is a pair of segments under repulsion or under lubrication (both: two),
-counted for both fibers; a contact is a pair with D <= 2a; coordination number = distinct touching
-fibers; overlap = max(0, 2a - D) in radii, mean over touching pairs.
+Definitions: orientation tensors a_ij, A_ijkl of segments weighted by length, and (names that end in
+`_fiber`) of end-to-end vectors, one vote per fiber; an interaction is a pair of segments under
+repulsion or under lubrication (both: two), counted for both fibers; a contact is a pair with
+D <= 2a; coordination number = distinct touching fibers; overlap = max(0, 2a - D) in radii, mean
+over touching pairs.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.measure import (
     FIBER_MAXIMA,
     FIBER_SUMS,
+    FIBER_SUMS4,
     PAIR_SUMS,
-    TENSOR,
-    TENSOR4,
     TERMS,
     MeasureFeatures,
     make_measure_fibers,
@@ -29,6 +29,7 @@ from warpfiber.passes.measure import (
 )
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pairs import PairFeatures
+from warpfiber.passes.tensor_sums import TENSOR
 
 CHUNKS = 256
 FIBER_QUANTITIES = {"orientation", "orientation4", "axial_strain", "energy", "curvature"}
@@ -49,6 +50,7 @@ class Measurement:
         inertia: bool = True,
     ) -> None:
         self.model, self.state = model, state
+        self.counted = model.fiber_count  # of its fibers, the first ones; the others are absent
         self.inertia = inertia
         self.quantities = frozenset(quantities)
         self.pair_features = pair_features
@@ -123,12 +125,12 @@ class Measurement:
         model, state, wanted = self.model, self.state, self.quantities
         features = self._fiber_features()
         p, low = model.precision, np.asarray(model.domain.low)
-        columns = len(FIBER_SUMS) + (len(TENSOR4) if features.orientation4 else 0)
+        columns = len(FIBER_SUMS) + (len(FIBER_SUMS4) if features.orientation4 else 0)
         values, largest = self._sums(
             self._fiber_kernel(),
             columns,
             len(FIBER_MAXIMA),
-            model.fiber_count,
+            self.counted,
             [
                 p.vec3(*low),
                 p.vec3(*(low + np.asarray(model.domain.size))),
@@ -145,16 +147,18 @@ class Measurement:
         row: dict[str, float] = {}
         if "orientation" in wanted:
             row |= {name: sums[name] / sums["length"] for name in TENSOR}
-            row |= {f"{n}_fiber": sums[f"{n}_fiber"] / model.fiber_count for n in TENSOR}
+            row |= {f"{n}_fiber": sums[f"{n}_fiber"] / self.counted for n in TENSOR}
         if features.orientation4:
-            for index, value in zip(TENSOR4, values[len(FIBER_SUMS) :], strict=True):
-                name = "a" + "".join(str(i + 1) for i in index)
-                row[name] = value / sums["length"]
+            for name, value in zip(FIBER_SUMS4, values[len(FIBER_SUMS) :], strict=True):
+                by_number = name.endswith("_fiber")
+                row[name] = value / (model.fiber_count if by_number else sums["length"])
         if "axial_strain" in wanted:
             row["axial_strain_max"] = largest[0]
         if features.curvature:
             row["curvature_mean"] = sums["curvature"] / sums["length"] / model.units.length
             row["curvature_max"] = largest[1] / model.units.length
+            row["bending_strain_mean"] = sums["bending_strain"] / sums["length"]
+            row["bending_strain_max"] = largest[2]
         if features.energy:
             names = ["energy_kinetic"] if features.inertia else []
             names += ["energy_stretching", "energy_bending"]
@@ -174,7 +178,7 @@ class Measurement:
             largest = float(maxima[0])
             if "contacts" in wanted:
                 coordination = self._coordination(pairs, touches.numpy())
-        fibers = model.fiber_count
+        fibers = self.counted
         row: dict[str, float] = {}
         if "interactions" in wanted:
             row["interactions_per_fiber"] = 2.0 * (sums["repelling"] + sums["lubricating"]) / fibers
@@ -218,7 +222,7 @@ class Measurement:
         touching = touches[: len(i)] != 0
         fiber = self.model.host["segment_fiber"]
         keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
-        return 2.0 * len(np.unique(keys, axis=0)) / self.model.fiber_count
+        return 2.0 * len(np.unique(keys, axis=0)) / self.counted
 
 
 def measure_fiber_terms(

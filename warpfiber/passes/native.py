@@ -10,12 +10,12 @@ PREFETCH_NODES = 100_000  # from so many nodes on they do not stay in a cache
 LANES = {"float32": 16, "float64": 8}  # 64 bytes
 
 
-def lane_types(name: str) -> str:
+def lane_types(name: str, lanes: int | None = None) -> str:
     """Real T, vector V of W lanes, U the same at any address, mask M, vector triple V3."""
     real = {"float32": "float", "float64": "double"}[precision(name).name]
     return f"""
     using T = {real};
-    constexpr int W = {LANES[name]};
+    constexpr int W = {lanes or LANES[name]};
     typedef T V __attribute__((ext_vector_type(W)));
     typedef T U __attribute__((ext_vector_type(W), aligned(sizeof(T))));
     typedef decltype(V() < V()) M;
@@ -34,7 +34,7 @@ def lane_types(name: str) -> str:
 """
 
 
-def transpose(lanes: int, rows: str = "r") -> str:
+def transpose(lanes: int, rows: str = "r", kind: str = "V") -> str:
     """Statements that transpose the square `rows[lanes]` of vectors in place, log2(lanes) stages.
 
     A stage with distance h swaps the off-diagonal h x h parts of every 2h x 2h part.
@@ -49,9 +49,43 @@ def transpose(lanes: int, rows: str = "r") -> str:
             high = [n + distance if not n & distance else lanes + n for n in range(lanes)]
             a, b = f"{rows}[{i}]", f"{rows}[{i + distance}]"
             lines.append(
-                f"{{ V a = {a}, b = {b};"
+                f"{{ {kind} a = {a}, b = {b};"
                 f" {a} = __builtin_shufflevector(a, b, {', '.join(map(str, low))});"
                 f" {b} = __builtin_shufflevector(a, b, {', '.join(map(str, high))}); }}"
             )
         distance *= 2
     return "\n".join(lines)
+
+
+# Between arrays of c numbers per node, fibers anywhere, and c vectors per node: squares of W
+# numbers of W fibers. The last square of a fiber overlaps the one before.
+def transfers(kind: str, lanes: int) -> str:
+    """`load_V` and `store_V` of vectors of this kind, for the `first` nodes of `own` fibers."""
+    turn = transpose(lanes, kind=kind)
+    return f"""
+    auto load_{kind} = [&](int c, {kind}* to, const auto* from) __attribute__((noinline)) {{
+        const int size = c * nodes;
+        for (int next = 0; next < size; next += W) {{
+            const int at = next < size - W ? next : size - W;
+            {kind} r[W];
+            #pragma unroll
+            for (int l = 0; l < W; ++l)
+                __builtin_memcpy(&r[l], from + (long)c * first[l] + at, sizeof({kind}));
+            {turn}
+            #pragma unroll
+            for (int l = 0; l < W; ++l) to[at + l] = r[l];
+        }}
+    }};
+    auto store_{kind} = [&](int c, auto* to, const {kind}* from) __attribute__((noinline)) {{
+        const int size = c * nodes;
+        for (int next = 0; next < size; next += W) {{
+            const int at = next < size - W ? next : size - W;
+            {kind} r[W];
+            #pragma unroll
+            for (int l = 0; l < W; ++l) r[l] = from[at + l];
+            {turn}
+            for (int l = 0; l < own; ++l)
+                __builtin_memcpy(to + (long)c * first[l] + at, &r[l], sizeof({kind}));
+        }}
+    }};
+"""

@@ -45,7 +45,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         approach: real,
         slot: wp.int32,
         memories: wp.array(dtype=vec3),
-        stiffnesses: wp.array(dtype=real),
+        depths: wp.array(dtype=real),
     ):
         """n points into the box; gap from the wall to the center; approach: speed of the wall.
 
@@ -56,8 +56,8 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         depth = g.radius - gap
         if depth <= zero:
             if wp.static(has_friction):
-                if stiffnesses[slot] != zero:
-                    stiffnesses[slot] = zero
+                if depths[slot] != zero:
+                    depths[slot] = zero
             return force, moment, zero
         k = plane_stiffness(g.wall_modulus, g.radius, depth)
         speed = wp.dot(node.v, n) - approach
@@ -68,13 +68,13 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
             slide -= wp.dot(slide, n) * n
             stiffness = real(4.0) * g.compliance / g.shear_compliance * k
             turn = half * dt * wp.dot(node.w, n)
-            memory = carried_memory(memories[slot], stiffnesses[slot], stiffness, n, turn)
+            memory = carried_memory(memories[slot], depths[slot], depth, n, turn)
             resistance = dashpot * beta * wp.sqrt(stiffness * mass)
             force, memory = friction_force(
                 memory + dt * slide, stiffness, resistance, slide, friction * size
             )
             memories[slot] = memory
-            stiffnesses[slot] = stiffness
+            depths[slot] = depth
             moment = wp.cross(arm, force)
         return force + size * n, moment, size
 
@@ -90,7 +90,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         wall_place: wp.array(dtype=wp.vec3d),
         wall_velocity: wp.array(dtype=wp.vec2d),
         memories: wp.array(dtype=vec3),
-        stiffnesses: wp.array(dtype=real),
+        depths: wp.array(dtype=real),
     ):
         force = vec3(zero, zero, zero)
         moment = vec3(zero, zero, zero)
@@ -123,7 +123,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                         approach,
                         wp.static(SIDES) * i + 2 * axis + side,
                         memories,
-                        stiffnesses,
+                        depths,
                     )
                     force += push
                     moment += couple

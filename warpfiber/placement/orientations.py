@@ -1,5 +1,6 @@
 """Directions of straight fibers from a second-order orientation tensor.
 
+Law `acg` (default) or `bingham` (see `bingham`).
 Source: angular central Gaussian (ACG) distribution, p = C^(1/2) z / |C^(1/2) z| with z normal
     (Tyler, Biometrika 74 (1987) 579): what random directions become in a linear flow. Its second
     moments are Carlson's R_D (Carlson, Numer. Algorithms 10 (1995) 13, duplication).
@@ -13,11 +14,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from warpfiber.placement.bingham import draw_bingham
 from warpfiber.placement.capsules import Floats
 
 FLAT = 1e-9
 """Eigenvalues of A below this are taken as zero."""
+LEAST = 1e-32
+"""Smallest covariance over the largest: what is less is zero, its moment below rounding."""
 FEWEST = 10
 """Samples with fewer fibers are left as drawn: six moments cannot be set with them."""
 
@@ -52,25 +57,21 @@ def orientation_tensor(directions: Floats) -> Floats:
     return np.asarray(directions.T @ directions / max(len(directions), 1))
 
 
-def carlson_rd(x: float, y: float, z: float) -> float:
-    """R_D = 3/2 int_0^inf dt / [sqrt((t + x)(t + y)) (t + z)^(3/2)]; x, y >= 0, z > 0."""
-    total, power = 0.0, 1.0
+def carlson_rd(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Floats:
+    """R_D = 3/2 int_0^inf dt / [sqrt((t + x)(t + y)) (t + z)^(3/2)]; x, y >= 0, z > 0; (...)."""
+    x, y, z = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (x, y, z)))
+    total, power = np.zeros(x.shape), 1.0
     mean = start = (x + y + 3.0 * z) / 5.0
-    spread = max(abs(start - x), abs(start - y), abs(start - z)) * 10.0
     x0, y0 = x, y
-    while spread * power > abs(mean):
+    spread = np.max(np.abs(start - np.stack([x, y, z])), axis=0) * 10.0
+    rounds = 0
+    # Two more halvings than converged make the series below exact to rounding.
+    while rounds < 4 or np.any(spread * power * 256.0 > np.abs(mean)):
         root_x, root_y, root_z = np.sqrt(x), np.sqrt(y), np.sqrt(z)
         step = root_x * root_y + root_x * root_z + root_y * root_z
-        total += power / (root_z * (z + step))
+        total = total + power / (root_z * (z + step))
         power *= 0.25
-        x, y, z = (x + step) / 4.0, (y + step) / 4.0, (z + step) / 4.0
-        mean = (mean + step) / 4.0
-    # Two more halvings make the series below exact to rounding.
-    for _ in range(4):
-        root_x, root_y, root_z = np.sqrt(x), np.sqrt(y), np.sqrt(z)
-        step = root_x * root_y + root_x * root_z + root_y * root_z
-        total += power / (root_z * (z + step))
-        power *= 0.25
+        rounds += 1
         x, y, z = (x + step) / 4.0, (y + step) / 4.0, (z + step) / 4.0
         mean = (mean + step) / 4.0
     dx, dy = (start - x0) * power / mean, (start - y0) * power / mean
@@ -80,24 +81,18 @@ def carlson_rd(x: float, y: float, z: float) -> float:
     e4 = 3.0 * (dx * dy - dz * dz) * dz * dz
     e5 = dx * dy * dz**3
     series = 1.0 - 3.0 * e2 / 14.0 + e3 / 6.0 + 9.0 * e2 * e2 / 88.0 - 3.0 * e4 / 22.0
-    series += -9.0 * e2 * e3 / 52.0 + 3.0 * e5 / 26.0
-    return float(power * mean**-1.5 * series + 3.0 * total)
+    series = series - 9.0 * e2 * e3 / 52.0 + 3.0 * e5 / 26.0
+    return np.asarray(power * mean**-1.5 * series + 3.0 * total)
 
 
 def acg_moments(c: Floats) -> Floats:
-    """Eigenvalues of A of covariances c (3,), zeros allowed: a_i = R_D / (3 sqrt(c1 c2 c3))."""
+    """Eigenvalues of A of covariances c (..., 3), zeros allowed: a_i = R_D / (3 sqrt(c1 c2 c3))."""
     c = np.asarray(c, dtype=np.float64)
-    live = c > 0.0
-    if np.count_nonzero(live) == 1:
-        return live.astype(np.float64)
-    if np.count_nonzero(live) == 2:
-        root = np.sqrt(c)
-        return np.asarray(root / root.sum())
-    c = c / c.max()
+    c = np.maximum(c / c.max(axis=-1, keepdims=True), LEAST)
     r = 1.0 / c
-    scale = 3.0 * np.sqrt(c.prod())
-    a = np.array([carlson_rd(r[(k + 1) % 3], r[(k + 2) % 3], r[k]) / scale for k in range(3)])
-    return np.asarray(a / a.sum())
+    a = carlson_rd(np.roll(r, -1, axis=-1), np.roll(r, -2, axis=-1), r)
+    a = a / np.sqrt(c.prod(axis=-1, keepdims=True))
+    return np.asarray(a / a.sum(axis=-1, keepdims=True))
 
 
 def acg_covariance(eigen: Floats) -> Floats:
@@ -118,9 +113,14 @@ def acg_covariance(eigen: Floats) -> Floats:
     return np.asarray(c / c.sum())
 
 
-def draw_directions(tensor: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """`count` random unit vectors (n, 3), ACG with second moment A."""
+def draw_directions(
+    tensor: Floats, count: int, rng: np.random.Generator, law: str = "acg"
+) -> Floats:
+    """`count` random unit vectors (n, 3) with second moment A, by law `acg` or `bingham`."""
     eigen, axes = np.linalg.eigh(tensor)
+    live = eigen > FLAT
+    if law == "bingham" and np.count_nonzero(live) > 1:
+        return np.asarray(draw_bingham(eigen[live], count, rng) @ axes[:, live].T)
     spread = np.sqrt(acg_covariance(np.maximum(eigen, 0.0)))
     raw = rng.standard_normal((count, 3)) * spread
     length = np.linalg.norm(raw, axis=1)

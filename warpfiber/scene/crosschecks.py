@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import math
 
+from warpfiber.scene.arrays import check_arrays
 from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
 from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
+from warpfiber.scene.gripping import GRIPPING, check_gripping
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
+from warpfiber.scene.pouring import check_pouring
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
+from warpfiber.scene.starting import check_saving
 from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
@@ -44,17 +48,18 @@ def cross_check(draft: Draft) -> None:
     _check_contact(draft)
     _check_stages(draft)
     _check_rest(draft)
+    _check_record(draft)
+    check_arrays(draft)
     check_loads(draft)
     check_pressing(draft)
+    check_gripping(draft)
+    check_pouring(draft)
+    check_saving(draft)
 
 
 def _check_tables(draft: Draft) -> None:
     """Ask for the tables that a scene, or its method, cannot do without."""
-    if draft.start is not None:
-        for name in ("fibers", "box"):
-            if draft.is_given(name):
-                draft.faults.add(name, None, "given together with [start]; [start] brings it")
-    elif not draft.fibers and not draft.faulty("fibers"):
+    if draft.start is None and not draft.fibers and not draft.faulty("fibers"):
         draft.faults.add("fibers", None, "missing; add at least one [[fibers]]")
     if not draft.stages and not draft.faulty("stage"):
         draft.faults.add("stage", None, 'missing; add a [[stage]] with kind = "flow"')
@@ -315,7 +320,19 @@ def _check_rest(draft: Draft) -> None:
     if not still:
         return
     for index, stage in enumerate(draft.stages):
+        if stage["kind"] in GRIPPING:  # have a strain of their own
+            continue
         if stage["end_strain"] is not None and stage["end_time"] is None:
             draft.blame(f"stage.{index}.end_strain", "the fluid rests; end the stage by end_time")
     if draft.record["every_strain"] is not None:
         draft.blame("record.every_strain", "the fluid rests; use every_time or frames")
+
+
+def _check_record(draft: Draft) -> None:
+    """Layers are slices of a box, and stress is force over its faces."""
+    if draft.box is not None or draft.start is not None:
+        return
+    if draft.record["layers"]:
+        draft.blame("record.layers", "layers are slices of a box; add [box], or remove it")
+    if "stress" in (draft.record["quantities"] or ()) and draft.method in INERTIALESS:
+        draft.blame("record.quantities", "stress is that of a box; add [box], or remove stress")

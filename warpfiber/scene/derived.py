@@ -122,6 +122,13 @@ def reach(law: str, lubrication: str, radius: float) -> float:
     return radius * (REPULSION_REACH if lubrication == "none" else LUBRICATION_REACH)
 
 
+def group_volume(scene: Scene, group: FiberGroup) -> float:
+    """Volume of one fiber of a group, m^3, by the box's volume rule; rings have no ends."""
+    rule = scene.box.volume_rule if scene.box is not None else "cylinder"
+    ring = group.shape.kind == "ring"
+    return fiber_volume("centerline" if ring else rule, group.diameter, group.length)
+
+
 def fiber_volume(rule: str, diameter: float, length: float) -> float:
     """Volume of a straight fiber of `length` L tip to tip, m^3, by the box's volume rule.
 

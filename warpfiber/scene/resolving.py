@@ -11,9 +11,10 @@ import math
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
+from warpfiber.scene.gripping import GRIPPING, strain_time
 from warpfiber.scene.keys import Values
-from warpfiber.scene.pressing import PRESSING, passing_time
-from warpfiber.scene.statistics import resolve_layers, resolve_lengths
+from warpfiber.scene.pressing import PRESSING, loading_time, passing_time
+from warpfiber.scene.statistics import check_law, resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
 LENGTH_KEYS = ("aspect_ratio", "length", "centerline_length", "length_distribution")
@@ -33,13 +34,15 @@ ROUNDING = 1e-9
 def resolve(draft: Draft) -> None:
     """Complete all tables of the draft; faults go to its list."""
     _resolve_flow(draft)
-    for index, group in enumerate(draft.fibers):
+    for index, group in enumerate(draft.fibers if draft.saved is None else ()):
         resolve_lengths(draft, group, f"fibers.{index}")
         resolve_layers(draft, group, f"fibers.{index}")
+        check_law(draft, group, f"fibers.{index}")
         _resolve_length(draft, group, f"fibers.{index}")
         _resolve_group(draft, group, f"fibers.{index}")
         _resolve_count(draft, group, f"fibers.{index}")
-    _resolve_segments(draft)
+    if draft.saved is None:
+        _resolve_segments(draft)
     _resolve_contact(draft)
     _resolve_stages(draft)
     record = draft.record
@@ -120,7 +123,7 @@ def _resolve_group(draft: Draft, group: Values, path: str) -> None:
         if not file.is_file():
             draft.blame(f"{path}.node_file", f"no such file: {file}; it is sought beside the scene")
         group["node_file"] = str(file.absolute())
-        for key in ("orientation", "direction", "position", "shape"):
+        for key in ("orientation", "direction", "orientation_law", "position", "shape"):
             if draft.is_given(f"{path}.{key}"):
                 draft.note(f"{path}.{key} has no effect; node_file has the nodes")
 
@@ -257,16 +260,24 @@ def _resolve_contact(draft: Draft) -> None:
 def _resolve_stages(draft: Draft) -> None:
     """Name the stages, and limit the time of those that no strain or time ends.
 
-    A wall on its way limits it by itself.
+    A wall on its way limits it by itself; the strain of grips is a time.
     """
     for index, stage in enumerate(draft.stages):
         if stage["name"] is None:
             stage["name"] = stage["kind"]
         ended = any(draft.is_given(f"stage.{index}.{key}") for key in ("end_strain", "end_time"))
         if stage["time_limit"] is None and not ended:
-            stage["time_limit"] = passing_time(draft, stage) or 100.0
+            longest = loading_time if stage["control"] == "load" else passing_time
+            stage["time_limit"] = longest(draft, stage) or 100.0
         if stage["kind"] in PRESSING and stage["control"] is None:
             stage["control"] = "displacement"
+        seconds = strain_time(stage)
+        if seconds is not None:
+            stage["end_time"] = min(seconds, stage["end_time"] or seconds)
+        if stage["kind"] in GRIPPING and stage["freeze"] is None:
+            stage["freeze"] = "fibers"
+        for key, default in (("batch", 1), ("interval", 0.0), ("damping", 0.0)):
+            stage[key] = default if stage[key] is None else stage[key]
         if stage["repeat"] is None:
             stage["repeat"] = 1
 

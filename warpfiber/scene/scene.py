@@ -34,7 +34,7 @@ class Stage:
     """One `[[stage]]`: what happens until its first end condition, counted from its start."""
 
     kind: str
-    """flow, settle, compress, unload"""
+    """flow, settle, pour, compress, unload, pull, shear"""
     name: str
     """the kind, if none was given"""
     save: bool = False
@@ -51,11 +51,23 @@ class Stage:
     wall: str | None = None
     """of the box, that moves in compress and unload: z+ and the like"""
     speed: float | None = None
-    """m/s, of that wall"""
+    """m/s, of that wall (under a load at most), or of the upper grip"""
     control: str | None = None
-    """displacement"""
+    """displacement; load: the pressure on the wall changes at `pressure_rate`"""
+    pressure_rate: float | None = None
+    """Pa/s"""
     damping: float = 0.0
-    """1/s on the velocities of the nodes, of `settle`"""
+    """1/s on the velocities of the nodes, of `settle` and `pour`"""
+    interval: float = 0.0
+    """s from batch to batch that is poured"""
+    batch: int = 1
+    """fibers that are poured at a time"""
+    freeze_below: float | None = None
+    """m, height up to which the bed is held still in pull and shear"""
+    freeze_above: float | None = None
+    """m, height from which it moves at `speed`"""
+    freeze: str | None = None
+    """fibers, nodes"""
     repeat_from: str | None = None
     """name of an earlier stage (or this one)"""
     repeat: int = 1

@@ -1,0 +1,215 @@
+"""SIMD sweep over bonded spheres against the plain ones: the same laws, fibers side by side.
+
+Bounds: float64 1e-13, float32 64 eps of the largest change; sums are in another order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.bonded_crowd import crowd
+from warpfiber.methods import bonded_spheres
+from warpfiber.methods.bonded_launches import bond_launch, drift_launch, pair_launch
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
+from warpfiber.passes.executor import Launch, load_kernels
+from warpfiber.passes.native_bonds_source import BEGIN, END, LOADS
+from warpfiber.simulation import Simulation
+
+BOUND = {"float64": 1e-13, "float32": 64 * np.finfo(np.float32).eps}
+NODES = "place node_velocity node_turn node_spin node_rate node_spin_rate".split()
+KEPT = [*NODES, "still_steps", "wall_memory", "wall_depth"]
+
+
+def arrays(sim: Simulation) -> dict[str, Any]:
+    """All that a sweep changes."""
+    method: Any = sim.method
+    kept = {name: getattr(method, name) for name in KEPT if hasattr(method, name)}
+    state = sim.state
+    return kept | {
+        "place": method.place,
+        "node_pos": state.node_pos,
+        "node_velocity": state.node_velocity,
+        "status": state.status,
+        "acts": method.contacts.acts,
+        "grip": method.grips.node_grip,
+        "memory": method.contacts.memory,
+        "written": method.contacts.written,
+    }
+
+
+def after(sim: Simulation, launches: Iterable[Launch]) -> dict[str, np.ndarray]:
+    """Arrays after the launches; the simulation is left as it was."""
+    kept = {name: array.numpy().copy() for name, array in arrays(sim).items()}
+    launches = list(launches)
+    load_kernels([launch.kernel for launch in launches], "cpu")
+    for launch in launches:
+        launch.run("cpu")
+    found = {name: array.numpy().copy() for name, array in arrays(sim).items()}
+    for name, array in arrays(sim).items():
+        array.assign(kept[name])
+    return found
+
+
+def assert_near(sim: Simulation, found: Any, expected: Any, precision: str) -> None:
+    """Every array to the bound times its largest change."""
+    before = {name: array.numpy() for name, array in arrays(sim).items()}
+    for name in NODES:
+        change = np.abs(expected[name] - before[name]).max()
+        assert change > 0.0, name
+        error = np.abs(found[name].astype(float) - expected[name]).max()
+        scale = change if "place" not in name and "turn" not in name else np.abs(before[name]).max()
+        assert error < BOUND[precision] * scale, name
+    assert np.abs(found["grip"] - expected["grip"]).max(initial=0.0) < BOUND[precision] * np.abs(
+        expected["grip"]
+    ).max(initial=1.0)
+    for name in ("status", "still_steps"):
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+LOAD = [
+    {"fiber": 3, "node": 0, "hold": "clamp", "velocity": [0.01, 0.0, 0.0]},
+    {"fiber": 9, "node": 3, "hold": "position"},
+    {"fiber": 10, "node": -1, "force": [0.0, 2e-3, 0.0]},
+]
+SCENES: dict[str, dict[str, Any]] = {
+    "all": {},
+    "loads": {"load": LOAD},
+    "grips": {
+        "stage": [
+            {
+                "kind": "shear",
+                "speed": 0.01,
+                "freeze_below": 0.004,
+                "freeze_above": 0.016,
+                "end_strain": 1.0,
+            }
+        ]
+    },
+    "smooth": {"contact": {"friction": 0.0, "wall_friction": 0.0, "damping": 0.0}},
+    "open": {
+        "box": {"size": [0.06, 0.04, 0.02], "boundary": ["open"] * 3},
+        "contact": {"friction": 0.5, "damping": 0.113},
+    },
+}
+
+
+@pytest.mark.parametrize("precision", BOUND)
+@pytest.mark.parametrize("turn", [0.1, 0.9])
+@pytest.mark.parametrize("name", SCENES)
+def test_same_as_plain(precision: str, turn: float, name: str) -> None:
+    """Begin and end of a step; turns of neighbors by up to 3 rad take the long series."""
+    sim = crowd(precision, turn, **SCENES[name])
+    sim.prepare()
+    native = sim.method.native  # type: ignore[attr-defined]
+    assert native is not None
+    pairs = pair_launch(sim.method, sim.method.dt)  # type: ignore[arg-type]
+    begun = [drift_launch(sim.method), native.launch(BEGIN)]  # type: ignore[arg-type]
+    plain, simd = (after(sim, [launch]) for launch in begun)
+    for kept in ("node_rate", "node_spin_rate"):
+        np.testing.assert_array_equal(simd[kept], plain[kept])
+    for kept in ("place", "node_velocity", "node_turn", "node_spin"):
+        scale = np.abs(plain[kept]).max()
+        assert np.abs(simd[kept] - plain[kept]).max() < BOUND[precision] * scale
+    ends = bond_launch(sim.method, drifts=False, kicks=True)  # type: ignore[arg-type]
+    first = begun[0]
+    expected = after(sim, [first, pairs, ends])
+    assert expected["acts"].any()
+    found = after(sim, [first, pairs, native.launch(LOADS | END)])
+    assert_near(sim, found, expected, precision)
+    assert (name == "grips") == bool(expected["grip"].any())
+    if "wall" in str(sim.scene.box) and name != "smooth" and name != "open":
+        assert expected["wall_depth"].any()
+        np.testing.assert_array_equal(found["wall_memory"], expected["wall_memory"])
+
+
+@pytest.mark.parametrize("precision", BOUND)
+def test_joined(precision: str) -> None:
+    """End and begin in one launch or in two: the same bits."""
+    sim = crowd(precision, load=LOAD)
+    sim.prepare()
+    native = sim.method.native  # type: ignore[attr-defined]
+    pairs = pair_launch(sim.method, sim.method.dt)  # type: ignore[arg-type]
+    begin, end = native.launch(BEGIN), native.launch(LOADS | END)
+    apart = after(sim, [begin, pairs, end, begin])
+    joined = after(sim, [begin, pairs, native.launch(LOADS | END | BEGIN)])
+    for name in apart:
+        if name not in ("node_rate", "node_spin_rate"):
+            np.testing.assert_array_equal(joined[name], apart[name], name)
+
+
+@pytest.mark.parametrize("precision", BOUND)
+def test_runs(precision: str) -> None:
+    """Any parts of a run, and any workers: the same bits; with lists built on the way."""
+    runs = [crowd(precision, workers=workers) for workers in (1, 2)]
+    for sim in runs:
+        sim.step(120)
+    parts = crowd(precision)
+    for count in (1, 1, 2, 57, 59):
+        parts.step(count)
+    builds = parts.method.list.build_count  # type: ignore[union-attr]
+    assert builds > 2
+    first = runs[0].snapshot()
+    for other in (runs[1], parts):
+        for name, value in other.snapshot().items():
+            assert value.tobytes() == first[name].tobytes(), name
+    for sim in runs:
+        sim.close()
+
+
+def test_run_as_plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 steps: the same motion, the same contacts."""
+    sim = crowd()
+    before = sim.node_pos
+    monkeypatch.setattr(bonded_spheres, "NATIVE", False)
+    plain = crowd()
+    assert plain.method.native is None  # type: ignore[attr-defined]
+    for run in (sim, plain):
+        run.step(100)
+    moved = np.abs(plain.node_pos - before).max()
+    assert np.abs(sim.node_pos - plain.node_pos).max() < 1e-9 * moved
+    acts = [run.method.contacts.acts.numpy() for run in (sim, plain)]  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(*acts)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 100.0])
+@pytest.mark.parametrize("fiber", [2, 39])
+def test_torn(bad: float, fiber: int) -> None:
+    """A torn fiber is told; 39 is the last one of a padded block."""
+    sim = crowd()
+    sim.prepare()
+    place = sim.method.place.numpy()  # type: ignore[attr-defined]
+    place[sim.fiber_node_start[fiber] + 1, 1] += bad
+    native = sim.method.native  # type: ignore[attr-defined]
+    found = after(sim, [native.launch(LOADS | END)])
+    assert found["status"][TORN] == 1 and found["status"][BAD_FIBER] == fiber
+    others = np.delete(np.arange(len(place)), np.arange(*sim.fiber_node_start[fiber : fiber + 2]))
+    assert np.isfinite(found["node_velocity"][others]).all()
+
+
+def test_flags() -> None:
+    """A node that has moved past the skin is told; a halted launch changes nothing."""
+    sim = crowd()
+    sim.prepare()
+    native = sim.method.native  # type: ignore[attr-defined]
+    assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 0
+    far = sim.state.list_pos.numpy()
+    far[-1, 0] += 1.0
+    sim.state.list_pos.assign(far)
+    assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 1
+    words = sim.state.status.numpy().copy()
+    words[HALT] = 1
+    sim.state.status.assign(words)
+    before = {name: array.numpy().copy() for name, array in arrays(sim).items()}
+    for name, value in after(sim, [native.launch(LOADS | END | BEGIN)]).items():
+        np.testing.assert_array_equal(value, before[name], name)
+
+
+def test_where_it_applies() -> None:
+    """Fibers that do not meet leave the plain sweeps."""
+    alone = crowd(contact={"law": "none"})
+    assert alone.method.native is None  # type: ignore[attr-defined]
+    assert crowd().method.native is not None  # type: ignore[attr-defined]

@@ -1,0 +1,310 @@
+"""C++ text of the SIMD sweep over bonded spheres: what one block of fibers does (`native_bonds`).
+
+The laws of `bond` (`native_bond_law`) and `rotation`, one lane per fiber. Positions are float64 in
+every precision.
+Symbols: as in `bond`; T real, V and P vectors of T and double; x, v, q, w, a, b scratch of
+    positions, velocities, quaternions, spins, loads (then accelerations) and moments, one vector
+    per number of a node.
+"""
+
+import math
+
+from warpfiber.laws.rotation import LARGEST_HALF_ANGLE
+from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
+from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
+from warpfiber.passes.native import lane_types, transfers
+from warpfiber.passes.native_bond_law import BONDS, bond_constants
+
+LANES = 8  # fibers, in both precisions
+
+LOADS, END, BEGIN = 1, 2, 4
+"""What a launch does, in this order: accelerations, half kick, half kick with drift."""
+
+
+def _constants(features: BondFeatures) -> str:
+    """Features and numbers that are fixed when the sweep is compiled."""
+    flags = {
+        "HAS_DASHPOTS": features.dashpots,
+        "HAS_LOADS": features.loads,
+        "HAS_WALLS": any(features.walls),
+        "HAS_PAIRS": features.pairs,
+        "HAS_GRIPS": features.grips,
+    }
+    lines = [f"constexpr bool {key} = {str(value).lower()};" for key, value in flags.items()]
+    tables = {
+        "COSINE": [(-1.0) ** n / math.factorial(2 * n) for n in range(6)],
+        "SINE": [(-1.0) ** n / math.factorial(2 * n + 1) for n in range(6)],
+    }
+    for key, values in tables.items():
+        text = ", ".join(f"T({float(value)!r})" for value in values)
+        lines.append(f"constexpr T {key}[{len(values)}] = {{{text}}};")
+    lines.append(f"constexpr T LARGEST = T({LARGEST_HALF_ANGLE**2!r});")
+    slots = {
+        "SLOT_EXPIRED": EXPIRED,
+        "SLOT_TORN": TORN,
+        "SLOT_HALT": HALT,
+        "SLOT_BAD_FIBER": BAD_FIBER,
+        "SLOT_SETTLING": SETTLING,
+        "SLOT_END_SPEED": END_SPEED,
+        "IS_FREE": FREE,
+        "IS_CLAMPED": CLAMPED,
+        "IS_LOWER": LOWER,
+        "LOADS": LOADS,
+        "END": END,
+        "BEGIN": BEGIN,
+    }
+    lines += [f"constexpr int {key} = {value};" for key, value in slots.items()]
+    return "\n".join(lines)
+
+
+# Loads of pairs, fiber by fiber: few nodes have any.
+_GATHER = """
+    for (int c = 0; c < 3 * nodes; ++c) a[c] = b[c] = V(T(0));
+    if constexpr (HAS_PAIRS) {
+        auto add = [&](int l, int k, int segment, T sign, T share, T arm) {
+            T* to_a = (T*)(a + 3 * segment) + l;
+            T* to_b = (T*)(b + 3 * segment) + l;
+            const T* force = (const T*)pair_force + 3 * k;
+            const T* moment = (const T*)pair_moment + 3 * k;
+            #pragma unroll
+            for (int c = 0; c < 3; ++c) {
+                const T push = sign * force[c], couple = arm * moment[c];
+                const T second_push = share * push, second_couple = share * couple;
+                to_a[c * W] += push - second_push;
+                to_a[(3 + c) * W] += second_push;
+                to_b[c * W] += couple - second_couple;
+                to_b[(3 + c) * W] += second_couple;
+            }
+        };
+        const T* arms = (const T*)pair_arms;
+        for (int l = 0; l < own; ++l) {
+            const int begin = first[l] - fiber[l];
+            const int end = begin + segments;
+            for (int k = out_start[begin]; k < out_start[end]; ++k)
+                if (pair_acts[k])
+                    add(l, k, pair_i[k] - begin, T(1), arms[4 * k], arms[4 * k + 2]);
+            for (int slot = in_start[begin]; slot < in_start[end]; ++slot) {
+                const int k = in_pair[slot];
+                if (pair_acts[k])
+                    add(l, k, pair_j[k] - begin, T(-1), arms[4 * k + 1], arms[4 * k + 3]);
+            }
+        }
+    }
+"""
+
+_RATES = """
+    if (any(torn))
+        for (int l = 0; l < own; ++l)
+            if (torn[l]) {
+                status[SLOT_TORN] = 1;
+                status[SLOT_BAD_FIBER] = fiber[l];
+            }
+    if constexpr (HAS_GRIPS)
+        for (int l = 0; l < own; ++l)
+            for (int k = 0; k < nodes; ++k)
+                if (node_hold[first[l] + k] >= IS_LOWER)
+                    for (int c = 0; c < 3; ++c)
+                        ((T*)node_grip)[3L * (first[l] + k) + c] = ((T*)(a + 3 * k + c))[l];
+    if constexpr (HAS_WALLS)
+        for (int l = 0; l < own; ++l)
+            for (int k = 0; k < nodes; ++k)
+                if (node_touches[first[l] + k])
+                    for (int c = 0; c < 3; ++c) {
+                        const long from = 3L * (first[l] + k) + c;
+                        ((T*)(a + 3 * k + c))[l] += ((const T*)node_push)[from];
+                        ((T*)(b + 3 * k + c))[l] += ((const T*)node_couple)[from];
+                    }
+    const V3 weight = same3(g.weight[0], g.weight[1], g.weight[2]);
+    const V settling = V(stage[SLOT_SETTLING]);
+    for (int k = 0; k < nodes; ++k) {
+        const bool tip = k == 0 || k == segments;
+        const V mass = V(T(1) / (tip ? g.end_mass : g.mass));
+        const V inertia = V(T(1) / (tip ? g.end_inertia : g.inertia));
+        if constexpr (HAS_LOADS)
+            for (int l = 0; l < own; ++l)
+                if (node_hold[first[l] + k] == IS_FREE)
+                    for (int c = 0; c < 3; ++c)
+                        ((T*)(a + 3 * k + c))[l] += ((const T*)node_load)[3L * (first[l] + k) + c];
+        put(a, k, get(a, k) * mass + weight - get(v, k) * settling);
+        put(b, k, get(b, k) * inertia - get(w, k) * settling);
+    }
+"""
+
+# A held node has no acceleration; its velocity is set where the first half kick ends a step.
+_HOLD = """
+            if constexpr (HAS_LOADS)
+                for (int l = 0; l < own; ++l) {
+                    const int hold = node_hold[first[l] + k];
+                    if (hold == IS_FREE) continue;
+                    for (int c = 0; c < 3; ++c) {
+                        ((T*)(a + 3 * k + c))[l] = T(0);
+                        ((T*)&speed)[c * W + l] =
+                            ((const T*)node_load)[3L * (first[l] + k) + c];
+                        if (hold >= IS_CLAMPED) {
+                            ((T*)(b + 3 * k + c))[l] = T(0);
+                            ((T*)&spin)[c * W + l] = T(0);
+                        }
+                    }
+                }
+"""
+
+_MOVE = """
+    const V kick = V(T(0.5) * dt);
+    V fastest2 = V(T(0)), furthest = V(T(0));
+    for (int k = 0; k < nodes; ++k) {
+        V3 speed = get(v, k), spin = get(w, k);
+        if (loads) {
+            if (ends) {
+                speed = speed + get(a, k) * kick;
+                spin = spin + get(b, k) * kick;
+            }
+            HOLD
+            const V size2 = speed.dot(speed);
+            fastest2 = size2 > fastest2 ? size2 : fastest2;
+        }
+        if (begins) {
+            speed = speed + get(a, k) * kick;
+            spin = spin + get(b, k) * kick;
+            P3 at = get_P(x, k);
+            at.x += widen(speed.x * dt);
+            at.y += widen(speed.y * dt);
+            at.z += widen(speed.z * dt);
+            x[3 * k] = at.x;
+            x[3 * k + 1] = at.y;
+            x[3 * k + 2] = at.z;
+            const V3 turn = spin * kick;
+            const V z = turn.dot(turn);
+            V cosine = COSINE[3] + z * (COSINE[4] + z * COSINE[5]);
+            cosine = T(1) + z * (COSINE[1] + z * (COSINE[2] + z * cosine));
+            V sine = SINE[3] + z * (SINE[4] + z * SINE[5]);
+            sine = T(1) + z * (SINE[1] + z * (SINE[2] + z * sine));
+            if (__builtin_expect(any(z > LARGEST), 0))
+                for (int l = 0; l < W; ++l)
+                    if (z[l] > LARGEST) {
+                        const T h = wp::sqrt(T(z[l]));
+                        cosine[l] = wp::cos(h);
+                        sine[l] = wp::sin(h) / h;
+                    }
+            const V4 old = get4(q, k);
+            const V3 r = turn * sine;
+            V3 vector = old.v * cosine + r * old.s + r.cross(old.v);
+            V scalar = cosine * old.s - r.dot(old.v);
+            const V back = T(1.5) - T(0.5) * (vector.dot(vector) + scalar * scalar);
+            q[4 * k] = vector.x * back;
+            q[4 * k + 1] = vector.y * back;
+            q[4 * k + 2] = vector.z * back;
+            q[4 * k + 3] = scalar * back;
+            if constexpr (HAS_PAIRS) {
+                const V3 now = {narrow(at.x), narrow(at.y), narrow(at.z)};
+                const V3 moved = now - get(listed, k);
+                const V far = __builtin_elementwise_sqrt(moved.dot(moved))
+                    + dt * __builtin_elementwise_sqrt(speed.dot(speed));
+                furthest = far > furthest ? far : furthest;
+                if (IS_SINGLE) put(listed, k, now);
+            }
+        }
+        put(v, k, speed);
+        put(w, k, spin);
+    }
+"""
+
+_STORE = """
+    store_V(3, (T*)node_velocity, v);
+    store_V(3, (T*)node_spin, w);
+    if (begins) {
+        store_P(3, (double*)place, x);
+        store_V(4, (T*)node_turn, q);
+        if (IS_SINGLE && HAS_PAIRS) store_V(3, (T*)node_pos, listed);
+        if constexpr (HAS_PAIRS) {
+            const M expired = ~(furthest <= T(0.5) * list_sizes[1]);
+            if (any(expired))
+                for (int l = 0; l < own; ++l)
+                    if (expired[l]) status[SLOT_EXPIRED] = 1;
+        }
+    } else {
+        store_V(3, (T*)node_rate, a);
+        store_V(3, (T*)node_spin_rate, b);
+    }
+    if (ends)
+        for (int l = 0; l < own; ++l)
+            still_steps[fiber[l]] =
+                fastest2[l] < stage[SLOT_END_SPEED] ? still_steps[fiber[l]] + 1 : 0;
+"""
+
+_SWEEP = """
+    const int* fiber = block_fiber + W * block;
+    const int own = block_own[block];
+    const auto g = groups[fiber_group[fiber[0]]];
+    const int segments = g.segments, nodes = segments + 1;
+    int first[W];
+    for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
+    const bool loads = phase & LOADS, ends = phase & END, begins = phase & BEGIN;
+
+    P* x = (P*)__builtin_alloca_with_align(3 * nodes * sizeof(P), 512);
+    V* v = (V*)__builtin_alloca_with_align(23 * nodes * sizeof(V), 512);
+    V* w = v + 3 * nodes;
+    V* q = w + 3 * nodes;
+    V* a = q + 4 * nodes;
+    V* b = a + 3 * nodes;
+    V* axis = b + 3 * nodes;
+    V* length = axis + 3 * nodes;
+    V* listed = length + nodes;
+    struct P3 { P x, y, z; };
+    struct V4 { V3 v; V s; };
+    auto get = [](const V* u, int k) -> V3 { return V3{u[3 * k], u[3 * k + 1], u[3 * k + 2]}; };
+    auto get_P = [](const P* u, int k) -> P3 { return P3{u[3 * k], u[3 * k + 1], u[3 * k + 2]}; };
+    auto get4 = [](const V* u, int k) -> V4 {
+        return V4{V3{u[4 * k], u[4 * k + 1], u[4 * k + 2]}, u[4 * k + 3]};
+    };
+    auto put = [](V* u, int k, const V3& values) {
+        u[3 * k] = values.x;
+        u[3 * k + 1] = values.y;
+        u[3 * k + 2] = values.z;
+    };
+    auto narrow = [](P values) -> V { return __builtin_convertvector(values, V); };
+    auto widen = [](V values) -> P { return __builtin_convertvector(values, P); };
+"""
+
+_LOAD = """
+    load_P(3, x, (const double*)place);
+    load_V(3, v, (const T*)node_velocity);
+    load_V(4, q, (const T*)node_turn);
+    load_V(3, w, (const T*)node_spin);
+    if (begins && HAS_PAIRS) load_V(3, listed, (const T*)list_pos);
+    if (loads) {
+        load_V(3, axis, (const T*)bond_axis);
+        load_V(1, length, (const T*)bond_length);
+        GATHER
+        BONDS
+    } else {
+        load_V(3, a, (const T*)node_rate);
+        load_V(3, b, (const T*)node_spin_rate);
+    }
+"""
+
+
+def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> str:
+    """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
+    addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
+    work = _LOAD.replace("GATHER", _GATHER).replace("BONDS", BONDS + _RATES)
+    work += _MOVE.replace("HOLD", _HOLD) + _STORE
+    types = lane_types(name, LANES)
+    places = "auto& load_P = load_V; auto& store_P = store_V;"
+    if name == "float32":
+        places = transfers("P", LANES)
+    return f"""
+    auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
+    #pragma clang fp contract(fast)
+    {types}
+    typedef double P __attribute__((ext_vector_type(W)));
+    constexpr bool IS_SINGLE = sizeof(T) == 4;
+    {_constants(features)}
+    {bond_constants()}
+    if (status[SLOT_HALT] != 0) return;
+    {_SWEEP}
+    {transfers("V", LANES)}
+    {places}
+    {work}
+    }};
+    sweep();
+    """
