@@ -27,7 +27,8 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
                                  "curvature", "stress"),
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
-    Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
+    Row("wall", "kind", ("fiber_array",),
+        'remove the table; planes come from boundary = "wall", stages move them'),
 )  # fmt: skip
 
 

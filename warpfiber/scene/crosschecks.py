@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from warpfiber.scene.arrays import check_arrays
 from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
 from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
@@ -48,6 +49,7 @@ def cross_check(draft: Draft) -> None:
     _check_stages(draft)
     _check_rest(draft)
     _check_record(draft)
+    check_arrays(draft)
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)
