@@ -276,6 +276,8 @@ def _resolve_stages(draft: Draft) -> None:
             stage["end_time"] = min(seconds, stage["end_time"] or seconds)
         if stage["kind"] in GRIPPING and stage["freeze"] is None:
             stage["freeze"] = "fibers"
+        for key, default in (("batch", 1), ("interval", 0.0), ("damping", 0.0)):
+            stage[key] = default if stage[key] is None else stage[key]
         if stage["repeat"] is None:
             stage["repeat"] = 1
 

@@ -254,6 +254,7 @@ STAGE = Table(
         Key("pressure_rate", Number("Pa/s", above=0), required=True, when=("control", ("load",))),
         Key("damping", Number("1/s", least=0), default=0.0, when=("kind", ("settle", "pour"))),
         Key("interval", Number("s", least=0), default=0.0, when=("kind", ("pour",))),
+        Key("batch", COUNT, when=("kind", ("pour",))),
         Key("freeze_below", Number("m"), required=True, when=("kind", DRAG)),
         Key("freeze_above", Number("m"), required=True, when=("kind", DRAG)),
         Key("freeze", Choice(("fibers", "nodes")), when=("kind", DRAG)),
