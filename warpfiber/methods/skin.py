@@ -27,6 +27,7 @@ START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
+LASTING = 1.3  # uses of a step that a skin must have room for
 MEMORY = 0.5  # weight of the use before in the mean
 # Measured: listed pairs grow with the volume from this part of the distance in contact on.
 CORE = 0.85
@@ -70,18 +71,30 @@ class SkinChoice:
     def _steps_since(self, step: int) -> int:
         return max(0, step - max(self.built_step, self.begun))
 
-    def choose(self, step: int, pairs_per_segment: float) -> float:
-        """The skin of the next build, after the present one was used up at `step`."""
-        used = self.skin / max(1, step - self.built_step)
+    def choose(self, step: int, pairs_per_segment: float, used: float | None = None) -> float:
+        """The skin of the next build, after the present one was used up at `step`.
+
+        `used` of it per step, if that is known: then no skin is chosen that lasts none.
+        """
+        least_lasting = 0.0
+        if used is None:
+            used = self.skin / max(1, step - self.built_step)
+        else:
+            least_lasting = LASTING * max(used, self.use)
         self.use = used if self.use == 0.0 else MEMORY * self.use + (1.0 - MEMORY) * used
         if self.fixed or pairs_per_segment <= 0.0:
             return self.skin
         low = max(self.least, self.skin / LARGEST_CHANGE)
         high = min(self.largest, self.skin * LARGEST_CHANGE)
         best, least = self.skin, WORTH * self.cost(self.skin, pairs_per_segment)
+        if best < least_lasting:
+            best, least = min(self.largest, least_lasting), math.inf
         skin = self.least
         while skin <= high:
-            if skin >= low and (cost := self.cost(skin, pairs_per_segment)) < least:
+            if (
+                skin >= max(low, least_lasting)
+                and (cost := self.cost(skin, pairs_per_segment)) < least
+            ):
                 best, least = skin, cost
             skin *= RATIO
         return best
