@@ -102,6 +102,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        pair_clear: wp.array(dtype=real),
         pair_slots_out: wp.array(dtype=wp.uint8),
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
@@ -116,8 +117,15 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
         reach = (real(2.0) + keep) * widest
+        looked_at = reach
+        if wp.static(has_lubrication):
+            looked_at = wp.max(reach, real(2.0) * outer * widest)
         total = wp.int32(0)
         for k in range(out_start[i], out_start[i + 1]):
+            if pair_clear[k] > looked_at:
+                pair_slots_out[k] = wp.uint8(0)
+                pair_row_count_out[k] = 0
+                continue
             j = pair_j[k]
             node_j = segment_node[j]
             xj = node_back[node_j]
