@@ -177,7 +177,6 @@ class Energies:
             "dissipated_bonds": features.dashpots,
             "dissipated_contacts": spheres.scene.contact.damping > 0.0,
             "dissipated_friction": rubs,
-            "dissipated_settling": any(stage.damping > 0.0 for stage in spheres.scene.stages),
         }
         unit = model.units.energy
         return {name: value * unit for name, value in row.items() if present.get(name, True)}
@@ -192,7 +191,7 @@ class Energies:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over what `saved` returned."""
-        if self.told:
+        """Take over what `saved` returned; sums begin now after a run that told no energy."""
+        if self.told and "energy_lost" in arrays:
             self.lost.assign(arrays["energy_lost"])
             self.rubbed.assign(arrays["energy_rubbed"])

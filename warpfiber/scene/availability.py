@@ -27,9 +27,10 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
-                                 "curvature", "stress"),
+                                 "curvature", "stress", "inclination"),
         "remove the others from the list"),
-    Row("record", "node_fields", ("velocity",), "remove the others from the list"),
+    Row("record", "node_fields", ("velocity", "bond_stress", "contact_count"),
+        "remove the others from the list"),
     Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
 )  # fmt: skip
 
@@ -48,6 +49,7 @@ FLOWING = (
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+    Row("record", "node_fields", ("velocity",), "remove it; it is of method bonded_spheres"),
 )
 SOFT = Row("contact", "law", ("none", "exponential", "linear"),
            'use law = "exponential", "linear" or "none"')  # fmt: skip
