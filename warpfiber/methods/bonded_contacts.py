@@ -106,7 +106,7 @@ class BondedContacts:
         count = self.search.list.pair_count
         for name in ("acts", "force", "arms"):
             getattr(self, name)[:count].assign(arrays[f"contact_{name}"])
-        if self.features.friction and "contact_memory" in arrays:
+        if self.features.friction:
             side = step % 2
             self.memory[side, :count].assign(arrays["contact_memory"])
             self.written[side, :count].assign(arrays["contact_written"])
