@@ -15,6 +15,7 @@ from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
 from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
+from warpfiber.passes.native_capsules import capsule_chunks, make_native_capsule_pairs
 from warpfiber.passes.native_nodes import fiber_blocks
 
 REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
@@ -214,9 +215,46 @@ class NativeBonds:
         kernel = make_native_bond_sweep(p.name, spheres.features)
         return Launch("bonds", kernel, self.block_own.shape[0], inputs, split=True)
 
+    def pair_launch(self, dt: float) -> Launch:
+        """What all listed pairs do; memories of friction move on by dt."""
+        spheres, contacts = self.spheres, self.spheres.contacts
+        model, state, p = spheres.model, spheres.state, spheres.model.precision
+        assert contacts is not None
+        pairs, chunks = contacts.search.list, capsule_chunks(model.segment_count)
+        inputs = [
+            chunks,
+            p.real(dt),
+            p.real(spheres.scene.contact.damping),
+            p.real(spheres.scene.contact.friction),
+            p.real(REACH_MARGIN * pairs.reach),
+            spheres.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            model.segment_node,
+            model.segment_fiber,
+            state.lattice_now,
+            pairs.out_start,
+            pairs.pair_i,
+            pairs.pair_j,
+            pairs.pair_image,
+            spheres.place,
+            state.node_velocity,
+            spheres.node_spin,
+            state.step,
+            contacts.acts,
+            contacts.force,
+            contacts.moment,
+            contacts.arms,
+            contacts.memory,
+            contacts.written,
+            state.status,
+        ]
+        kernel = make_native_capsule_pairs(p.name, contacts.features)
+        return Launch("pairs", kernel, chunks, inputs, split=True)
+
     def kernels(self) -> list[Any]:
         """What a step launches."""
-        launches = [clock_launch(self.spheres), pair_launch(self.spheres, 0.0)]
+        launches = [clock_launch(self.spheres), self.pair_launch(0.0)]
         launches += [self.launch(0), *self.spheres.press.motion(), *self.spheres.press.meter()]
         launches += self.spheres.grips.meter()
         return [launch.kernel for launch in launches]
@@ -224,7 +262,7 @@ class NativeBonds:
     def steps(self, halted: Callable[[], bool]) -> JoinedSteps:
         """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick."""
         spheres = self.spheres
-        clock, pairs = clock_launch(spheres), pair_launch(spheres, spheres.dt)
+        clock, pairs = clock_launch(spheres), self.pair_launch(spheres.dt)
         motion = spheres.press.motion()
         meter = [*spheres.press.meter(), *spheres.grips.meter()]
         drift = self.launch(BEGIN)

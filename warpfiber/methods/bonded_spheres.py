@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -188,7 +189,8 @@ class BondedSpheres(Method):
             if self.contacts.build(self.step_count):
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), self._rates()]
+            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
+            first = [pairs(0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()

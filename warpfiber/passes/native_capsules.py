@@ -1,0 +1,131 @@
+"""The pair sweep of bonded spheres on the CPU: distances and contacts of eight pairs at a time.
+
+A pair is a lane; nothing in a lane depends on the others, so it does not matter how the list is cut
+into parts for launch indices and workers.
+
+Limits: CPU only (clang vector types), else `capsule_pairs`; multiplications and additions are
+    fused and powers are by series: equal to rounding.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpfiber.model import precision
+from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.native_capsules_source import capsule_sweep_source
+
+CHUNK_SEGMENTS = 128  # segments per launch index
+# Arguments of the sweep that are arrays.
+ARRAYS = """
+    groups fiber_node_start fiber_group segment_node segment_fiber lattice out_start pair_i pair_j
+    pair_image place node_velocity node_spin step pair_acts pair_force pair_moment pair_arms
+    pair_memory pair_step status
+""".split()
+
+
+def capsule_chunks(segment_count: int) -> int:
+    """Launch dimension of the sweep; every index takes an equal share of the list."""
+    return max(1, segment_count // CHUNK_SEGMENTS)
+
+
+@cache
+def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
+    """Kernel `native_capsule_pairs` over `chunks` parts of the list."""
+    p = precision(name)
+    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
+    BondGroup = bond_group_struct(name)
+
+    @wp.func_native(capsule_sweep_source(name, features, ARRAYS))
+    def sweep_chunk(
+        chunk: wp.int32,
+        chunks: wp.int32,
+        dt: real,
+        beta: real,
+        friction: real,
+        largest_reach: real,
+        groups: wp.array(dtype=BondGroup),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        lattice: wp.array(dtype=mat33),
+        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        place: wp.array(dtype=wp.vec3d),
+        node_velocity: wp.array(dtype=vec3),
+        node_spin: wp.array(dtype=vec3),
+        step: wp.array(dtype=wp.int64),
+        pair_acts: wp.array(dtype=wp.uint8),
+        pair_force: wp.array(dtype=vec3),
+        pair_moment: wp.array(dtype=vec3),
+        pair_arms: wp.array(dtype=vec4),
+        pair_memory: wp.array2d(dtype=vec4),
+        pair_step: wp.array2d(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def native_capsule_pairs(
+        offset: wp.int32,
+        chunks: wp.int32,
+        dt: real,
+        beta: real,
+        friction: real,
+        largest_reach: real,
+        groups: wp.array(dtype=BondGroup),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        lattice: wp.array(dtype=mat33),
+        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        place: wp.array(dtype=wp.vec3d),
+        node_velocity: wp.array(dtype=vec3),
+        node_spin: wp.array(dtype=vec3),
+        step: wp.array(dtype=wp.int64),
+        pair_acts: wp.array(dtype=wp.uint8),
+        pair_force_out: wp.array(dtype=vec3),
+        pair_moment_out: wp.array(dtype=vec3),
+        pair_arms_out: wp.array(dtype=vec4),
+        pair_memory: wp.array2d(dtype=vec4),
+        pair_step: wp.array2d(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
+    ):
+        sweep_chunk(
+            wp.tid() + offset,
+            chunks,
+            dt,
+            beta,
+            friction,
+            largest_reach,
+            groups,
+            fiber_node_start,
+            fiber_group,
+            segment_node,
+            segment_fiber,
+            lattice,
+            out_start,
+            pair_i,
+            pair_j,
+            pair_image,
+            place,
+            node_velocity,
+            node_spin,
+            step,
+            pair_acts,
+            pair_force_out,
+            pair_moment_out,
+            pair_arms_out,
+            pair_memory,
+            pair_step,
+            status,
+        )
+
+    return native_capsule_pairs
