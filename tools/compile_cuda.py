@@ -52,6 +52,8 @@ from warpfiber.passes.measure import (
     make_measure_pairs,
     make_measure_terms,
 )
+from warpfiber.passes.measure_layers import make_measure_layers
+from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
@@ -66,6 +68,7 @@ from warpfiber.passes.step_control import (
     make_take_back,
 )
 from warpfiber.passes.wall_press import make_push_sum, make_wall_meter, make_wall_motion
+from warpfiber.passes.wall_servo import make_wall_servo
 
 ARCHITECTURES = (80, 90)
 PRECISIONS = ("float32", "float64")
@@ -75,6 +78,8 @@ FRAMES: dict[str, tuple[int, str]] = {
     "bond_drift": (40, "as bond_sweep"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
 }
+
+STRESS_KERNELS = ("drag_moments", "contact_moments")
 
 FORMAT_SIZED = 0x04
 ATTRIBUTE_FRAME = 0x11
@@ -240,6 +245,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
+    yield "steer_wall", "", make_wall_servo()
     yield "sum_grips", "", make_grip_sum(precision)
     yield "meter_grips", "", make_grip_meter()
     yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
@@ -283,6 +289,11 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         "overdamped": MeasureFeatures(energy=True, curvature=True, inertia=False),
     }.items():
         yield "measure_fibers", variant, make_measure_fibers(precision, fibers)
+    for tensor4 in (False, True):
+        kernel = make_measure_layers(precision, tensor4)
+        yield "measure_layers", "everything" if tensor4 else "orientation", kernel
+    for name, kernel in zip(STRESS_KERNELS, make_measure_stress(precision), strict=True):
+        yield name, "", kernel
     for variant, pairs in _pair_variants()[1:3]:
         yield "measure_pairs", variant, make_measure_pairs(precision, pairs)
     for variant in ("none", "closest"):

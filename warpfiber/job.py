@@ -21,6 +21,7 @@ import numpy as np
 
 from warpfiber.output.checkpoint import write_checkpoint
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.saved_stage import write_saved_stage
 from warpfiber.recording import Recording
 from warpfiber.restart import read_restart
 from warpfiber.scene import Fault, Scene, SceneError, Stage
@@ -44,7 +45,7 @@ class Job:
         self.progress = progress
         self.stages = self.scene.stage_sequence
         self.stage_index = 0
-        self.stage_start = (0.0, 0.0)  # strain and time where the stage began
+        self.stage_start = simulation.origin  # strain and time where the stage began
         self.row_index = 0
         self.frame_index = 0
         self.fresh = True  # the row and the frame of the start are still to be written
@@ -232,6 +233,9 @@ class Job:
         where = f"strain {strain:.6g}" if self.scene.flow else f"time {seconds:.6g} s"
         self.folder.log(f"stage '{stage.name}' ended at {where}")
         self.summary.end_stage(stage.name, self.simulation.method.stage_result(stage))
+        if stage.save:
+            arrays, attrs = self._saved_state(self.simulation.snapshot(), {"stage": stage.name})
+            write_saved_stage(self.folder.path, stage.name, arrays, attrs)
         self.stage_index += 1
         self.stage_start = (self.simulation.strain, self.simulation.time)
         self.row_index = self.frame_index = 0
@@ -332,13 +336,19 @@ class Job:
             self.good, self.good_attrs = arrays, self._position()
 
     def _write_checkpoint(self, arrays: dict[str, np.ndarray], position: dict[str, Any]) -> Path:
+        arrays, attrs = self._saved_state(arrays, position)
+        self.summary.checkpoint_time = time.perf_counter()
+        return write_checkpoint(self.folder.path, int(arrays["step"][0]), arrays, attrs)
+
+    def _saved_state(
+        self, arrays: dict[str, np.ndarray], position: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and attributes of a state with what is needed to build its simulation again."""
         start, group = self.simulation.fiber_node_start, self.simulation.model.host["fiber_group"]
-        attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
         length = np.asarray(self.simulation.model.units.length)
         layout = {"fiber_node_start": start, "fiber_group": group, "length": length}
-        self.summary.checkpoint_time = time.perf_counter()
-        step = int(arrays["step"][0])
-        return write_checkpoint(self.folder.path, step, arrays | layout, attrs)
+        attrs = self._attrs() | position | {"scene": json.dumps(self.scene.as_dict())}
+        return arrays | layout, attrs
 
     def _checkpoint_if_due(self) -> None:
         due = self.scene.record.checkpoint_every

@@ -26,10 +26,10 @@ def _goal(job: Any) -> tuple[str, float, float]:
     """Name, present value and end of what the stages are measured by, over the whole run."""
     stages = job.stages
     ends = [stage.end_strain for stage in stages]
-    if all(end is not None for end in ends):
+    if job.scene.flow is not None and all(end is not None for end in ends):
         return "strain", job.simulation.strain, float(sum(ends))
     times = [stage.end_time or stage.time_limit or 0.0 for stage in stages]
-    return "time", job.simulation.time, float(sum(times))
+    return "time", job.simulation.time - job.simulation.origin[1], float(sum(times))
 
 
 def _values(job: Any) -> dict[str, str]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from warpfiber.output.columns import write_columns
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.placement_table import write_placement
 from warpfiber.output.scalars import ScalarsWriter
 from warpfiber.output.trajectory import TrajectoryWriter
 from warpfiber.scene import Scene, Stage
@@ -44,7 +45,7 @@ class Recording:
         folder: ResultFolder,
         attrs: Mapping[str, Any],
     ) -> Recording:
-        """New files; `attrs` go into the trajectory. Raises RecordError."""
+        """New files, `placement.csv` whole; `attrs` go into the trajectory. Raises RecordError."""
         scalars = ScalarsWriter(folder.scalars_path, list(simulation.measure()))
         columns = {folder.scalars_path.name: scalars.columns}
         layers = trajectory = None
@@ -53,6 +54,7 @@ class Recording:
             layers = ScalarsWriter(folder.layers_path, names)
             columns[folder.layers_path.name] = layers.columns
         write_columns(folder.path / "columns.csv", columns)
+        write_placement(folder.path / "placement.csv", simulation.placement_report)
         if scene.record.trajectory:
             trajectory = TrajectoryWriter(
                 folder.trajectory_path,

@@ -21,6 +21,7 @@ from warpfiber.methods.method import Method
 from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
+from warpfiber.output.saved_stage import merged_arrays, read_saved_stage
 from warpfiber.passes.layer_profile import LayerProfile
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -130,9 +131,13 @@ class Simulation:
         stable.
         """
         scene = split_tables(with_device(scene, device))
+        saved = None
         if placement is None:
             preflight(scene)
-            placement = place_fibers(scene)
+            if scene.start is None:
+                placement = place_fibers(scene)
+            else:
+                saved, placement = read_saved_stage(scene)
         self.scene = realized_scene(scene, placement)
         self.limits = step_limits(self.scene)
         self.dt = check_step(self.scene)[0] if dt is None else dt
@@ -163,6 +168,9 @@ class Simulation:
                 [group_volume(self.scene, group) for group in self.scene.fibers],
                 "orientation4" in self.scene.record.quantities,
             )
+        if saved is not None:
+            self.restore(merged_arrays(saved, self.snapshot()))
+        self.origin = (self.strain, self.time)  # where the first stage begins; s
         self.begin_stage(self.scene.stage_sequence[0])
 
     # -- stepping ---------------------------------------------------------------------------------
@@ -201,7 +209,7 @@ class Simulation:
             while (steps := self.steps_to(until, time)) > 0:
                 self.step(steps)
             return
-        start = (0.0, 0.0)
+        start = self.origin
         for stage in self.scene.stage_sequence:
             self.begin_stage(stage)
             while (steps := self.stage_steps(stage, start)) > 0:

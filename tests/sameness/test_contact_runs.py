@@ -145,7 +145,9 @@ def test_resumed_job(tmp_path: Path, method: str) -> None:
     path = tmp_path / "one.toml"
     path.write_text(SCENE)
     segments = 1 if method == "rigid_rod" else 3
-    scene = wf.load_scene(path, {"numerics.method": method, "numerics.segments": segments})
+    keys: dict[str, object] = {"numerics.method": method, "numerics.segments": segments}
+    keys |= {"record.layers": 3, "record.quantities": ["orientation", "contacts", "stress"]}
+    scene = wf.load_scene(path, keys)
     whole = wf.Job.start(scene, out=tmp_path / "whole")
     assert whole.run() == 0
     job = wf.Job.start(scene, out=tmp_path / "parts")
@@ -167,8 +169,9 @@ def test_resumed_job(tmp_path: Path, method: str) -> None:
     assert job.run(Stop()) == 130
     assert job.simulation.strain < 2.9
     assert wf.Job.resume(tmp_path / "parts").run() == 0
-    rows = [(tmp_path / name / "scalars.csv").read_text() for name in ("whole", "parts")]
-    assert rows[0] == rows[1]
+    for file in ("scalars.csv", "layers.csv"):
+        rows = [(tmp_path / name / file).read_text() for name in ("whole", "parts")]
+        assert rows[0] == rows[1]
 
 
 # -- the same cell in other words -----------------------------------------------------------------

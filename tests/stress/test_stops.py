@@ -130,7 +130,7 @@ def test_max_wall_stops_with_a_checkpoint(shell: Shell) -> None:
 def test_resuming_a_finished_run_changes_nothing(shell: Shell) -> None:
     assert shell.run("out") == 0
     before = {path: path.read_bytes() for path in (shell.folder / "out").glob("*.[jc]s*")}
-    assert len(before) == 3  # scalars.csv, scene.json, summary.json
+    assert len(before) == 4  # scalars.csv, columns.csv, scene.json, summary.json
     assert shell("resume", shell.folder / "out", "--quiet") == 0
     assert all(path.read_bytes() == data for path, data in before.items())
 

@@ -113,7 +113,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
         *("rod_maps rod_step".split()),
         *("bond_sweep bond_drift carry_memory capsule_pairs measure_bonds".split()),
-        *("move_walls sum_pushes meter_walls".split()),
+        *("move_walls sum_pushes meter_walls steer_wall sum_grips meter_grips".split()),
         *listed,
         *contact,
     }

@@ -6,6 +6,7 @@ found again by another formula.
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ import pytest
 from tests.placed import segment_distance
 from tests.scene_text import GONE, faults_of
 from tests.unit.test_lengths import plate_cell
+from warpfiber.output.placement_table import write_placement
 from warpfiber.placement import place_fibers, split_tables
 from warpfiber.placement.chains import Chains, relax_chains
 from warpfiber.placement.layers import Drawn, Stack, draw_fibers, measured
 from warpfiber.placement.orientations import orientation_tensor
 from warpfiber.placement.populations import DEPTH
-from warpfiber.placement.slices import slices
+from warpfiber.placement.slices import largest_a33, slices
 from warpfiber.placement.space import Cell
 from warpfiber.scene import SceneError, scene_from_dict
 
@@ -300,3 +302,37 @@ def test_what_a_thin_layer_cannot_hold_is_told() -> None:
         layer["orientation"] = [0.3, 0.3, 0.4, 0, 0, 0]
     report = place_fibers(scene_from_dict(tables)).report["tables"][0]
     assert any("a33 is" in line and "not 0.4" in line for line in report["missed"])
+    reached = [layer["orientation"]["by_number"][2] for layer in report["layers"]]
+    most = [layer["largest_a33"]["by_number"] for layer in report["layers"]]
+    assert max(most) < 0.4 and all(a <= b for a, b in zip(reached, most, strict=True))
+    assert sum("cannot be reached" in line for line in report["missed"]) == 6
+
+
+def test_most_upright_fibers_between_two_planes() -> None:
+    """|p_z| <= (h - d)/(L - d): 1/4 and 1 of two fibers that weigh 3 and 1."""
+    by_number, by_length = largest_a33(np.array([3.0, 1.0]), 1.0, 1.5)
+    assert by_number == pytest.approx((0.25**2 + 1.0) / 2)
+    assert by_length == pytest.approx((3 * 0.25**2 + 1.0) / 4)
+    assert largest_a33(np.array([3.0]), 1.0, 0.5) == (0.0, 0.0)
+
+
+def test_table_of_what_was_asked_and_reached(tmp_path: Path) -> None:
+    """Every number of the report, with its weighting; tensors beside the largest a33."""
+    report = place_fibers(scene_from_dict(layered((3e-4, 0.02), (3e-4, 0.04)))).report
+    write_placement(tmp_path / "placement.csv", report)
+    with (tmp_path / "placement.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * (3 + 12)
+    place = {(r["layer"], r["quantity"], r["weighting"]): r for r in rows}
+    layers = report["tables"][0]["layers"]
+    assert float(place["1", "volume_fraction", ""]["asked"]) == 0.04
+    assert (
+        float(place["0", "weight_average_length", ""]["achieved"])
+        == (layers[0]["weight_average_length"])
+    )
+    for way in ("length", "number"):
+        row = place["1", "a33", way]
+        assert float(row["achieved"]) == layers[1]["orientation"][f"by_{way}"][2]
+        assert float(row["largest"]) == layers[1]["largest_a33"][f"by_{way}"]
+    write_placement(tmp_path / "none.csv", {"tables": []})
+    assert not (tmp_path / "none.csv").exists()

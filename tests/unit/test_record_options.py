@@ -54,3 +54,13 @@ def test_only_what_was_asked_for_is_measured(job: wf.Job) -> None:
     row = wf.read_scalars(job.folder.scalars_path)
     assert not {"contacts_per_fiber", "overlap_max", "energy_bending"} & set(row)
     assert 0.0 <= row["curvature_max"][-1] < 1.0 / 3.2e-5
+
+
+def test_bending_strain_is_radius_over_radius_of_curvature(job: wf.Job) -> None:
+    """Fibers of one radius, 5 um: to rounding."""
+    row = wf.read_scalars(job.folder.scalars_path)
+    assert row["curvature_max"][-1] > 0.0
+    for name in ("mean", "max"):
+        np.testing.assert_allclose(
+            row[f"bending_strain_{name}"], 5e-6 * row[f"curvature_{name}"], rtol=1e-12
+        )

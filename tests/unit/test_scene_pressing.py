@@ -76,6 +76,18 @@ def test_what_is_read() -> None:
     assert scene_from_dict(scene.as_dict()) == scene
 
 
+def test_a_loaded_wall() -> None:
+    """The limit is the time of the way and of the load; without an end of it that of all stages."""
+    load: dict[str, object] = {"stage.0.control": "load", "stage.0.pressure_rate": 100.0}
+    pressed = {"stage.0.end_pressure": 500.0, "stage.0.end_volume_fraction": GONE}
+    stage = bed(load | pressed).stages[0]
+    assert (stage.control, stage.pressure_rate) == ("load", 100.0)
+    assert stage.time_limit == pytest.approx(0.3 / 0.1 + 5.0, rel=1e-12)
+    assert bed(load).stages[0].time_limit == 100.0
+    long = bed(load | {"stage.0.end_time": 4.0})  # a led wall would leave the box
+    assert long.stages[0].end_time == 4.0
+
+
 SETTLE = {"kind": "settle", "end_time": 1.0}
 
 
@@ -93,8 +105,9 @@ REFUSED: list[tuple[dict[str, object], str, str]] = [
     ({"stage.0.wall": GONE}, "stage.0.wall", "missing"),
     ({"stage.0.speed": GONE}, "stage.0.speed", "missing"),
     ({"stage.0.speed": 0}, "stage.0.speed", "> 0"),
-    ({"stage.0.control": "load"}, "stage.0.control", "displacement"),
-    ({"stage.0.pressure_rate": 10.0}, "stage.0.pressure_rate", "remove it"),
+    ({"stage.0.control": "load"}, "stage.0.pressure_rate", "missing with control = load"),
+    ({"stage.0.control": "force"}, "stage.0.control", "displacement"),
+    ({"stage.0.pressure_rate": 10.0}, "stage.0.pressure_rate", 'add control = "load"'),
     ({"stage.0.end_volume_fraction": 0.05}, "stage.0.end_volume_fraction", "already"),
     ({"stage.1.end_volume_fraction": 0.05}, "stage.1.end_volume_fraction", "never reached"),
     ({"stage.0.end_pressure": 0}, "stage.0.end_pressure", "met from the start"),

@@ -24,6 +24,12 @@ def make_segment_distance(name):
     zero, one = real(0.0), real(1.0)
 
     @wp.func
+    def fraction(x: real) -> real:
+        """x between 0 and 1, as `wp.clamp` but without its care for what is not a number."""
+        low = wp.where(x > zero, x, zero)
+        return wp.where(low < one, low, one)
+
+    @wp.func
     def closest_fractions(delta: vec3, a: vec3, b: vec3) -> vec2:
         aa = wp.max(wp.dot(a, a), tiny)
         bb = wp.max(wp.dot(b, b), tiny)
@@ -31,9 +37,9 @@ def make_segment_distance(name):
         da = wp.dot(delta, a)
         db = wp.dot(delta, b)
         den = wp.max(aa * bb - ab * ab, eps * aa * bb)
-        s = wp.clamp((da * bb - db * ab) / den, zero, one)
-        t = wp.clamp((s * ab - db) / bb, zero, one)
-        s = wp.clamp((t * ab + da) / aa, zero, one)
+        s = fraction((da * bb - db * ab) / den)
+        t = fraction((s * ab - db) / bb)
+        s = fraction((t * ab + da) / aa)
         return vec2(s, t)
 
     return closest_fractions

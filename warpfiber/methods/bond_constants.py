@@ -88,3 +88,11 @@ def bond_constants(scene: Scene, group: FiberGroup) -> BondConstants:
         compliance=(1.0 - nu * nu) / modulus,
         shear_compliance=(2.0 - nu) * 2.0 * (1.0 + nu) / modulus,
     )
+
+
+def fiber_mass(scene: Scene, group: FiberGroup) -> float:
+    """Sum of the masses of the nodes of one fiber, kg."""
+    c = bond_constants(scene, group)
+    if is_closed(group):
+        return c.mass * group.segments
+    return c.mass * (group.segments - 1) + 2.0 * c.end_mass

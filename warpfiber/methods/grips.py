@@ -94,11 +94,11 @@ class Grips:
         gripped = np.zeros(0, dtype=np.int64)
         if not self.used:
             return gripped
-        units, was = self.model.units, self.stage is not None
+        units = self.model.units
         self.stage = stage if stage.kind in GRIPPING else None
         if self.stage is None:
             self.task.assign(_task())
-            if was and not resumed:
+            if not resumed:
                 self.holds.release()
             return gripped
         axis, speed = drawn_axis(stage), (stage.speed or 0.0) / units.velocity

@@ -18,7 +18,9 @@ from warpfiber.methods.contact import ImplicitContact, MovingResponse, StepArray
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import EXPIRED, TORN, Model, State
+from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat, flat, load_kernels
+from warpfiber.passes.fiber_stress import FiberStress
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.passes.step_control import (
@@ -62,6 +64,16 @@ class Implicit(Method):
         first = step_start(scene) / model.units.time if self.adaptive else self.dt
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
         self.contact: ImplicitContact | None = None
+        self.stress: FiberStress | None = None
+        if "stress" in scene.record.quantities and scene.flow is not None:
+            self.stress = FiberStress(
+                model,
+                state,
+                flow_origin=self.flow_origin,
+                viscosity=scene.flow.viscosity,
+                shears=scene.flow.kind == "simple_shear",
+                fiber_frozen=self._frozen(),
+            )
         # what the step consists of: one module for all kernels that are not of the fibers alone
         sheared, method = model.domain.sheared, scene.numerics.method
         self.module = kernel_module("step", p.name, method, sheared, self.adaptive, self.meets)
@@ -75,7 +87,7 @@ class Implicit(Method):
         if not self.meets:
             return
         scene, model = self.scene, self.model
-        frozen = np.asarray([group.frozen for group in scene.fibers])[model.host["fiber_group"]]
+        frozen = self._frozen()
         self.contact = ImplicitContact(
             scene,
             model,
@@ -104,6 +116,12 @@ class Implicit(Method):
             periodic=any(model.domain.periodic),
             sheared=model.domain.sheared,
         )
+
+    def _frozen(self) -> np.ndarray:
+        """(F,) whether a fiber only has prescribed motion."""
+        frozen = np.asarray([group.frozen for group in self.scene.fibers])
+        each: np.ndarray = frozen[self.model.host["fiber_group"]]
+        return each
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -205,6 +223,8 @@ class Implicit(Method):
     def prepare(self, measuring: Iterable[Any] = ()) -> None:
         """Compile, build the first list and capture, so that the next `advance` only steps."""
         contact = self.contact
+        if self.stress is not None:
+            measuring = [*measuring, *self.stress.kernels]
         if contact is not None and contact.search.list.build_count == 0:
             stepping = [x.kernel for x in flat(self.launches()) if isinstance(x, Launch)]
             load_kernels([*stepping, *contact.kernels(), *measuring], self.model.device)
@@ -237,18 +257,29 @@ class Implicit(Method):
 
     # -- what is saved and told -------------------------------------------------------------------
 
+    def measure(self) -> dict[str, float]:
+        """Stress of the fibers, Pa, where it is asked for."""
+        return self.stress.measure(self._solved_rows()) if self.stress is not None else {}
+
+    def _solved_rows(self) -> list[ContactRows]:
+        return [rows for rows, _ in self.contact.solves] if self.contact is not None else []
+
     def saved(self) -> dict[str, np.ndarray]:
         """Sizes of steps, and what contact depends on."""
         arrays = {
             f"implicit_{name}": getattr(self, name).numpy().copy()
             for name in ("step_size", "rejected")
         }
+        if self.stress is not None:
+            arrays["implicit_stress"] = self.stress.saved(self._solved_rows())
         return arrays | (self.contact.saved() if self.contact is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in ("step_size", "rejected"):
             getattr(self, name).assign(arrays[f"implicit_{name}"])
+        if self.stress is not None:
+            self.stress.restore(arrays["implicit_stress"])
         if self.contact is not None:
             self.contact.restore(arrays, self.step_count)
             self._stop_executor()

@@ -2,7 +2,9 @@
 
 A stage begins with a jump of its wall to the outermost fiber, if that lies further in; it then
 moves at the stage's speed, inwards to compress and outwards to unload. The pressure that ends a
-stage is the mean of the last steps; of `unload` also no touch at all. A stage that grips the bed
+stage is the mean of the last steps; of `unload` also no touch at all. With control = "load" the
+wall is a plate as heavy as the fibers, and its load changes at `pressure_rate` from what it bears
+when the stage begins; `speed` only bounds its motion. A stage that grips the bed
 begins with the upper wall back at the top of the box, where it leaves the bed free.
 Symbols: place of a wall, push = the normal force of all fibers on it, gap = distance of the two.
 """
@@ -15,9 +17,21 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.bond_constants import fiber_mass
 from warpfiber.model import Model, State
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.wall_press import CHUNK, make_push_sum, make_wall_meter, make_wall_motion
+from warpfiber.passes.wall_servo import (
+    BEGIN,
+    BOUND,
+    FIRST,
+    INWARD,
+    MASS,
+    RATE,
+    SERVO_SIZE,
+    SIDE,
+    make_wall_servo,
+)
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.gripping import GRIPPING, HEIGHT
@@ -26,7 +40,7 @@ from warpfiber.scene.pressing import PRESSING, pressed_axis, wall_side
 LOOK = 16  # steps from one look at the pressure to the next
 LEAST_GAP = 0.5  # diameters of the thickest fiber
 
-_CARRIED = "place velocity push mean work".split()
+_CARRIED = "place velocity push mean work servo".split()
 
 
 class Press:
@@ -45,6 +59,8 @@ class Press:
         self.push = wp.zeros(metered, dtype=wp.vec2d, device=device)
         self.mean = wp.zeros(metered, dtype=wp.vec3d, device=device)
         self.work = wp.zeros(metered, dtype=wp.float64, device=device)
+        self.loaded = any(stage.control == "load" for stage in scene.stages)
+        self.servo = wp.array(_led() * self.loaded, dtype=wp.float64, device=device)
         self.fiber_push = wp.zeros(fibers, dtype=wp.vec2d, device=device)
         self.chunk_push = wp.zeros(-(-fibers // CHUNK), dtype=wp.vec2d, device=device)
         if metered:
@@ -64,7 +80,12 @@ class Press:
         if self.axis < 0:
             return []
         inputs = [wp.float64(self.dt), self.state.status, self.velocity, self.place]
-        return [Launch("walls", make_wall_motion(self.axis), 1, inputs, follows=True)]
+        motion = Launch("walls", make_wall_motion(self.axis), 1, inputs, follows=True)
+        if not self.loaded:
+            return [motion]
+        inputs = [wp.float64(self.dt), self.state.status, self.state.time]
+        inputs += [self.servo, self.push, self.velocity]
+        return [Launch("wall servo", make_wall_servo(), 1, inputs, follows=True), motion]
 
     def meter(self) -> list[Launch]:
         """After them."""
@@ -84,7 +105,7 @@ class Press:
         """Let the stage's wall jump to the nodes (N, 3; run units) and give it its speed."""
         if self.axis < 0:
             return
-        velocity = np.zeros((1, 2))
+        velocity, servo = np.zeros((1, 2)), _led()
         if stage.kind in GRIPPING and self.axis == HEIGHT:
             self._set_places(np.array([self.place.numpy()[0], self.corners[1]]))
         if stage.kind in PRESSING:
@@ -92,8 +113,36 @@ class Press:
             inward = 1.0 - 2.0 * side
             self._jump(side, nodes)
             way = inward if stage.kind == "compress" else -inward
-            velocity[0, side] = way * (stage.speed or 0.0) / self.model.units.velocity
+            if stage.control == "load":
+                servo = self._servo(stage, side, inward)
+            else:
+                velocity[0, side] = way * (stage.speed or 0.0) / self.model.units.velocity
         self.velocity.assign(velocity)
+        if self.loaded:
+            self.servo.assign(servo)
+
+    def _servo(self, stage: Stage, side: int, inward: float) -> np.ndarray:
+        """The load of a stage, from the mean push now on."""
+        units, servo = self.model.units, np.zeros(SERVO_SIZE)
+        rate = (stage.pressure_rate or 0.0) * self.area / units.force * units.time
+        counts = np.bincount(self.model.host["fiber_group"], minlength=len(self.scene.fibers))
+        masses = [fiber_mass(self.scene, group) for group in self.scene.fibers]
+        servo[SIDE], servo[INWARD] = side, inward
+        servo[MASS] = math.fsum(counts * masses) / units.mass
+        servo[BOUND] = (stage.speed or 0.0) / units.velocity
+        servo[FIRST] = self.mean.numpy()[0][side]
+        servo[RATE] = rate if stage.kind == "compress" else -rate
+        servo[BEGIN] = float(self.state.time.numpy()[0])
+        return servo
+
+    def _load(self) -> float:
+        """Pressure (Pa) that the plate is loaded with now; NaN while the wall is led."""
+        servo = self.servo.numpy()
+        if servo[SIDE] < 0.0:
+            return math.nan
+        past = float(self.state.time.numpy()[0]) - servo[BEGIN]
+        load: float = max(0.0, servo[FIRST] + servo[RATE] * past)
+        return load * self.model.units.force / self.area
 
     def _jump(self, side: int, nodes: np.ndarray) -> None:
         """Never outwards: a wall that presses already would lose its contact."""
@@ -191,6 +240,8 @@ class Press:
             low, high = self.pressures().tolist()
             row |= {"pressure_low": low, "pressure_high": high}
             row |= {"volume_fraction": self._fraction()}
+            if self.loaded:
+                row["pressure_load"] = self._load()
         if "energy" in self.scene.record.quantities:
             row["wall_work"] = float(self.work.numpy()[0]) * self.model.units.energy
         return row
@@ -206,3 +257,10 @@ class Press:
         if self.axis >= 0:
             for name in _CARRIED:
                 getattr(self, name).assign(arrays[f"press_{name}"])
+
+
+def _led() -> np.ndarray:
+    """The servo of a wall that moves as told."""
+    servo = np.zeros(SERVO_SIZE)
+    servo[SIDE] = -1.0
+    return servo

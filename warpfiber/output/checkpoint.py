@@ -32,16 +32,28 @@ def write_checkpoint(
 
     Raises RecordError if the disk refuses it; the earlier checkpoints are then untouched.
     """
+    path = Path(folder) / f"checkpoint_{int(step)}.h5"
+    write_arrays(path, arrays, attrs)
+    with record_errors(path, "write"):
+        # Later steps are left from a run that went on from here before: they no longer match the
+        # record, and the latest checkpoint must be the one just written.
+        stale = [other for other in checkpoint_paths(folder) if _step(other) > step]
+        older = [other for other in checkpoint_paths(folder) if _step(other) < step]
+        for other in stale + older[KEPT_COUNT - 1 :]:
+            other.unlink(missing_ok=True)
+    return path
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> Path:
+    """Write one such file, whole or not at all; returns its path. Raises RecordError."""
     import h5py
 
-    path = Path(folder) / f"checkpoint_{int(step)}.h5"
     part = path.with_name(f".{path.name}.part")
     text = json.dumps(dict(attrs), default=_plain)
     with record_errors(path, "write"):
         try:
             with h5py.File(part, "w") as file:
                 file.attrs["attrs"] = text
-                file.attrs["step"] = int(step)
                 for name, values in arrays.items():
                     data = np.asarray(values)
                     dataset = file.create_dataset(f"arrays/{name}", data=data)
@@ -52,12 +64,6 @@ def write_checkpoint(
             _sync(path.parent)
         finally:
             part.unlink(missing_ok=True)
-        # Later steps are left from a run that went on from here before: they no longer match the
-        # record, and the latest checkpoint must be the one just written.
-        stale = [other for other in checkpoint_paths(folder) if _step(other) > step]
-        older = [other for other in checkpoint_paths(folder) if _step(other) < step]
-        for other in stale + older[KEPT_COUNT - 1 :]:
-            other.unlink(missing_ok=True)
     return path
 
 

@@ -20,6 +20,7 @@ from typing import Any
 from warpfiber.output.description import describe
 from warpfiber.output.record_error import RecordError
 from warpfiber.scene import Fault, SceneError
+from warpfiber.scene.starting import saved_stage_name, saved_stages
 
 __all__ = ["RecordError", "ResultFolder", "describe"]
 
@@ -156,6 +157,8 @@ def _remove_results(folder: Path) -> None:
     """Delete what a run writes, and nothing else that lies in the folder."""
     for path in [*(folder / name for name in _FILES), *folder.glob("checkpoint_*.h5")]:
         path.unlink(missing_ok=True)
+    for name in saved_stages(folder):
+        (folder / saved_stage_name(name)).unlink()
     for name in _FOLDERS:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)

@@ -16,13 +16,15 @@ from warpfiber.model import EXPIRED, OVERFLOW, ROW_NEED, STRETCHED, precision
 from warpfiber.passes.pairs import IMAGE_BITS, image_code
 
 MAX_CELLS_PER_PIECE = 4
-# Widths of a cell in the largest distance of midpoints that can be near, along and across a row.
-# Measured at 20,000 segments: (0.25, 0.6) finds 1.7 times fewer midpoints but takes 1.3 times as
-# long, since its runs are shorter than a vector.
-CELL_LENGTH, CELL_WIDTH = 0.1, 1.3
+# Widths of a cell in the largest distance of midpoints that can be near, along and across a row,
+# where vectors search and where one piece after the other does (not native). Measured at 20,000
+# segments: (0.25, 0.6) finds 1.7 times fewer midpoints but takes the vectors 1.3 times as long,
+# since its runs are shorter than one; without vectors (0.1, 0.6) takes 0.85 of (0.1, 1.3).
+CELL_LENGTH, CELL_WIDTH = 0.1, {True: 1.3, False: 0.6}
 NARROWEST, FEW_CELLS = 0.45, 4.0
 MOST_CELLS = 2000.0  # along one axis: a float32 still tells cells apart to a thousandth
 GEOMETRY_PLANES = 7  # midpoint, half axis, half length
+TINY = 1e-30  # added to squared lengths that are divided by
 PLANE_PADDING = 64  # a vector may read past the last piece
 WRAP_Y, WRAP_Z = 1 << IMAGE_BITS, 1 << (2 * IMAGE_BITS)
 NO_WRAP = image_code(0, 0, 0)
@@ -55,7 +57,11 @@ FETCH_AHEAD = r"""
 def make_cell_kernels(
     name: str, features: ListFeatures, native: bool = False, module: str = "unique"
 ):
-    """`place_fibers`, `start_list`, `bin_pieces`, `gather_pieces` as a dict by name."""
+    """`place_fibers`, `start_list`, `bin_pieces`, `gather_pieces` as a dict by name.
+
+    `geometry` of the pieces in the order of the cells: planes of one number each for vectors
+    (`native`), else two vec4 per piece: midpoint and half length, half axis a and 1 / a^2.
+    """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     px, py, pz = features.periodic
@@ -65,6 +71,7 @@ def make_cell_kernels(
     sheared = features.sheared
     pieces = features.pieces
     half = wp.float64(0.5)
+    stored = wp.float32 if native else wp.vec4f
     options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func
@@ -153,7 +160,10 @@ def make_cell_kernels(
         frame_out: wp.array(dtype=wp.float32),
         status: wp.array(dtype=wp.int32),
     ):
-        """Lattice, cells and cleared status. `frame`: cells per length (9), lattice (9)."""
+        """Lattice, cells and cleared status.
+
+        `frame`: cells per length (9), lattice (9), cells per length along every axis (3).
+        """
         h = lattice[0]
         if wp.static(resets):
             turns = excess_turns(h)
@@ -167,7 +177,7 @@ def make_cell_kernels(
         # rows of the inverse have the inverse heights of the box as lengths
         d = wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
         for axis in range(3):
-            width = near * wp.float64(CELL_WIDTH)
+            width = near * wp.float64(wp.static(CELL_WIDTH[native]))
             if axis == 0:
                 width = near * wp.float64(CELL_LENGTH)
             height = wp.float64(1.0) / wp.length(inverse[axis])
@@ -184,6 +194,7 @@ def make_cell_kernels(
             for col in range(3):
                 frame_out[3 * row + col] = wp.float32(inverse[row, col] * d[row])
                 frame_out[9 + 3 * row + col] = wp.float32(h[row, col])
+            frame_out[18 + row] = wp.float32(wp.length(inverse[row]) * d[row])
         status[wp.static(EXPIRED)] = 0
         status[wp.static(OVERFLOW)] = 0
         status[wp.static(STRETCHED)] = 0
@@ -242,7 +253,7 @@ def make_cell_kernels(
         piece_part: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
-        planes_out: wp.array(dtype=wp.float32),
+        geometry_out: wp.array(dtype=stored),
         start_out: wp.array(dtype=vec3),
         axis_out: wp.array(dtype=vec3),
         segment_out: wp.array(dtype=wp.int32),
@@ -288,11 +299,17 @@ def make_cell_kernels(
                     (n / wp.static(WRAP_Z)) - wp.static(WRAP_Y // 2),
                 ),
             )
-        for axis_number in range(3):
-            planes_out[axis_number * stride + k] = wp.float32(middle[axis_number])
-            planes_out[(axis_number + 3) * stride + k] = wp.float32(half_axis[axis_number])
         half_length = wp.length(half_axis)
-        planes_out[6 * stride + k] = wp.float32(half_length)
+        if wp.static(native):
+            for axis_number in range(3):
+                geometry_out[axis_number * stride + k] = wp.float32(middle[axis_number])
+                geometry_out[(axis_number + 3) * stride + k] = wp.float32(half_axis[axis_number])
+            geometry_out[6 * stride + k] = wp.float32(half_length)
+        else:
+            x, a = wp.vec3f(middle), wp.vec3f(half_axis)
+            inverse_aa = wp.float32(1.0) / (wp.dot(a, a) + wp.float32(TINY))
+            geometry_out[2 * k] = wp.vec4f(x[0], x[1], x[2], wp.float32(half_length))
+            geometry_out[2 * k + 1] = wp.vec4f(a[0], a[1], a[2], inverse_aa)
         if half_length > half * sizes[1]:
             status[wp.static(STRETCHED)] = 1
 

@@ -1,11 +1,10 @@
 """How launches run: captured once, replayed many times, by one worker or several.
 
-A step is a list of phases, a phase one launch over an index range, or phases that repeat until they
-say that they are done. With one worker a whole step (and a batch of steps) is one graph, on CPU and
-CUDA alike. With more workers (CPU only) every worker owns one graph per phase over its part of the
-range, and the phases are handed over by locks: Warp itself runs kernels serially on the CPU. No
-kernel writes where another index reads, so the result is the same to the last bit for any number of
-workers.
+A step is a list of launches, each over an index range, some of which repeat until they say that
+they are done. A whole step (and a batch of steps) is one graph, on CPU and CUDA alike. Warp itself
+runs kernels serially on the CPU: with more workers (CPU only) each has a graph of its own, over its
+part of every range, and they meet after every launch. No kernel writes where another index reads,
+so the result is the same to the last bit for any number of workers.
 
 Limits: nothing may be launched from another thread during a capture (Warp's recording is global).
 """
@@ -20,11 +19,12 @@ from typing import Any
 
 import warp as wp
 
-from warpfiber.passes.workers import Loop, Phase, Workers, wait_kernel
+from warpfiber.passes.workers import Barrier, Workers, meet_kernel, wait_kernel
 
 COMPILERS = min(os.cpu_count() or 1, 4)  # at a time; each takes some hundred MB
 BATCH = 16  # steps per graph where looking after every step would cost more than it saves
 BATCH_BELOW = 300  # items per step on the CPU; CUDA always batches
+WORKER_BATCH = 8  # steps between two looks of several workers: starting them takes 0.05 ms
 
 
 def load_kernels(kernels: Iterable[Any], device: str) -> None:
@@ -100,10 +100,9 @@ class Repeat:
 
     def run(self, device: str) -> None:
         """Record the loop: inside the graph where the device can, else as often as it may run."""
-        launches = [launch for launch in self.launches if launch.dim > 0]
 
         def body() -> None:
-            for launch in launches:
+            for launch in flat([self]):
                 launch.run(device)
 
         if device.startswith("cpu") or wp.is_conditional_graph_supported():
@@ -149,10 +148,18 @@ def median_times(steps: Sequence[StepTimes]) -> dict[str, float]:
 
 
 class Executor:
-    """Replays the steps made of `items`; `launches` are all of them, repeated or not."""
+    """Replays the steps made of `items`; `launches` are all of them, repeated or not.
+
+    `single`: they are replayed once at a time, so no batch of steps is captured.
+    """
 
     def __init__(
-        self, items: Sequence[Launch | Call | Repeat], device: str, workers: int = 1
+        self,
+        items: Sequence[Launch | Call | Repeat],
+        device: str,
+        workers: int = 1,
+        *,
+        single: bool = False,
     ) -> None:
         self.items = [item for item in items if isinstance(item, Repeat) or item.dim > 0]
         self.launches = flat(items)
@@ -165,9 +172,15 @@ class Executor:
         self._pool: Workers | None = None
         self._apart: list[tuple[list[Any], Launch | Call | Repeat]] = []
         if self.workers > 1:
-            phases = self._capture_phases(self.items)
-            load_kernels([wait_kernel()], device)
-            self._pool = Workers(phases, self.workers)
+            load_kernels([wait_kernel(), meet_kernel()], device)
+            self._barrier = Barrier(self.workers)
+            # all before the threads start: nothing may be launched during a capture
+            sizes = [1] if single else [1, WORKER_BATCH]
+            graphs = {
+                steps: [self._capture_worker(steps, k) for k in range(self.workers)]
+                for steps in sizes
+            }
+            self._pool = Workers(graphs, self.workers)
         else:
             self._single = self._capture_steps(1)
             self._batch: Any = None
@@ -179,33 +192,32 @@ class Executor:
                     item.run(self.device)
         return capture.graph
 
-    def _capture_phases(self, items: Iterable[Launch | Call | Repeat]) -> list[Phase]:
-        groups: list[list[Launch | Call] | Repeat] = []
-        for item in items:
-            if isinstance(item, Repeat):
-                groups.append(item)
-            elif item.follows and groups and isinstance(groups[-1], list):
-                groups[-1].append(item)
-            else:
-                groups.append([item])
-        return [
-            Loop(self._capture_phases(flat([group])), group.going.numpy())
-            if isinstance(group, Repeat)
-            else self._capture_phase(group)
-            for group in groups
-        ]
+    def _capture_worker(self, steps: int, worker: int) -> Any:
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for _ in range(steps):
+                self._record(self.items, worker)
+        return capture.graph
 
-    def _capture_phase(self, group: list[Launch | Call]) -> list[Any]:
-        graphs: list[Any] = []
-        for worker in range(self.workers):
-            if all(launch.part(worker, self.workers)[1] == 0 for launch in group):
-                graphs.append(None)
+    def _record(self, items: Sequence[Launch | Call | Repeat], worker: int) -> None:
+        """This worker's part of the items, and where it waits for the others."""
+        for k, item in enumerate(items):
+            if isinstance(item, Repeat):
+                self._record_loop(item, worker)
                 continue
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                for launch in group:
-                    launch.run(self.device, worker, self.workers)
-            graphs.append(capture.graph)
-        return graphs
+            item.run(self.device, worker, self.workers)
+            behind = items[k + 1] if k + 1 < len(items) else None
+            if not (isinstance(behind, Launch | Call) and behind.follows):
+                self._barrier.record(worker)
+
+    def _record_loop(self, loop: Repeat, worker: int) -> None:
+        """All workers must have looked whether it goes on before any of them may change that."""
+
+        def body() -> None:
+            self._barrier.record(worker)
+            self._record(flat([loop]), worker)
+
+        wp.capture_while(loop.going, body)
+        self._barrier.record(worker)
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
         """Replay up to `steps` steps, looking at `halted` after every graph."""

@@ -41,7 +41,6 @@ def _bin(pairs: NeighborList) -> Launches:
             pairs,
             "place_fibers",
             model.fiber_count,
-            0,
             pairs.wraps,
             state.lattice,
             state.gradient,
@@ -50,7 +49,6 @@ def _bin(pairs: NeighborList) -> Launches:
             state.node_velocity,
             state.fiber_image,
             state.list_pos,
-            split=False,
         ),
         _launch(
             pairs,
@@ -101,7 +99,7 @@ def _gather(pairs: NeighborList) -> Launch:
         pairs.piece_part,
         pairs.model.segment_node,
         pairs.state.node_pos,
-        pairs.planes,
+        pairs.geometry,
         pairs.sorted_start,
         pairs.sorted_axis,
         pairs.sorted_segment,
@@ -112,23 +110,20 @@ def _gather(pairs: NeighborList) -> Launch:
 
 
 # -- CPU: native search and sorts -----------------------------------------------------------------
-# Only what takes longer than waking the other workers is split. Of 225 ns per segment (20,000
-# segments) 5 are left to one worker: the sort into cells and the fibers put into the box.
+# All workers share every launch but the one that counts the cells.
 
 
 def _native_sort(pairs: NeighborList) -> Launch:
     return _launch(
         pairs,
         "sort_cells",
-        1,
-        0,
-        1,
+        pairs.workers,
+        pairs.workers,
         pairs.cells,
         pairs.piece_total,
         pairs.cell_key,
         pairs.cell_start,
         pairs.order,
-        split=False,
     )
 
 
@@ -151,7 +146,7 @@ def _native_pairs(pairs: NeighborList) -> Launches:
             pairs.cell_key,
             pairs.order,
             pairs.cell_start,
-            pairs.planes,
+            pairs.geometry,
             pairs.sorted_segment,
             pairs.sorted_wrap,
             model.segment_fiber,
@@ -246,14 +241,13 @@ def _plain_pairs(pairs: NeighborList) -> Launches:
             "find_pairs",
             count,
             pairs.row_capacity,
-            pairs.stride,
             pairs.sizes,
             pairs.cells,
             pairs.frame,
             state.lattice,
             pairs.cell_key,
             pairs.cell_start,
-            pairs.planes,
+            pairs.geometry,
             pairs.sorted_start,
             pairs.sorted_axis,
             pairs.sorted_segment,
@@ -276,18 +270,20 @@ def _plain_pairs(pairs: NeighborList) -> Launches:
             pairs.row_count,
             pairs.row_end,
             status,
-            pairs.pair_slot,
+            *rows,
+            pairs.pair_key,
+            pairs.found_j,
+            pairs.found_image,
             split=False,
         ),
         _launch(
             pairs,
-            "fetch_keys",
+            "number_places",
             capacity,
             segments,
-            pairs.row_i,
-            pairs.pair_slot,
             status,
             pairs.pair_key,
+            pairs.pair_slot,
             pairs.in_key,
             pairs.in_pair,
             split=False,
@@ -300,8 +296,8 @@ def _plain_pairs(pairs: NeighborList) -> Launches:
             segments,
             pairs.out_start,
             pairs.pair_slot,
-            pairs.row_j,
-            pairs.row_image,
+            pairs.found_j,
+            pairs.found_image,
             status,
             pairs.pair_i,
             pairs.pair_j,

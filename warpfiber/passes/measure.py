@@ -33,8 +33,9 @@ FIBER_SUMS = (
     "energy_bending",
     "curvature",
     "energy_wall",
+    "bending_strain",
 )
-FIBER_MAXIMA = ("axial_strain_max", "curvature_max")
+FIBER_MAXIMA = ("axial_strain_max", "curvature_max", "bending_strain_max")
 # Behind them with orientation4: by length, then one vote per fiber.
 FIBER_SUMS4 = (*TENSOR4_NAMES, *(f"{name}_fiber" for name in TENSOR4_NAMES))
 PAIR_SUMS = ("touching", "repelling", "lubricating", "overlap", "energy_repulsion")
@@ -170,8 +171,11 @@ def make_measure_fibers(name: str, features: MeasureFeatures, module: str = "uni
                             sums_out[chunk, 15] + half * wp.float64(g.bending) * bent
                         )
                         curvature = angle / rest
+                        surface = wp.float64(g.radius) * curvature
                         sums_out[chunk, 16] = sums_out[chunk, 16] + curvature * rest
+                        sums_out[chunk, 18] = sums_out[chunk, 18] + surface * rest
                         maxima_out[chunk, 1] = wp.max(maxima_out[chunk, 1], curvature)
+                        maxima_out[chunk, 2] = wp.max(maxima_out[chunk, 2], surface)
                     n0 = n1
                 edge0 = edge
 

@@ -156,6 +156,8 @@ class Measurement:
         if features.curvature:
             row["curvature_mean"] = sums["curvature"] / sums["length"] / model.units.length
             row["curvature_max"] = largest[1] / model.units.length
+            row["bending_strain_mean"] = sums["bending_strain"] / sums["length"]
+            row["bending_strain_max"] = largest[2]
         if features.energy:
             names = ["energy_kinetic"] if features.inertia else []
             names += ["energy_stretching", "energy_bending"]

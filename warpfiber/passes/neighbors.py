@@ -183,13 +183,17 @@ class NeighborList:
         self._wraps = 0
         self.inverse = wp.zeros(1, dtype=wp.mat33d, device=device)
         self.cells = wp.zeros(1, dtype=wp.vec3i, device=device)
-        self.frame = wp.zeros(18, dtype=wp.float32, device=device)
+        self.frame = wp.zeros(21, dtype=wp.float32, device=device)
         self.cell_start = self._int(self.cell_capacity + 1)
         in_sort = 1 if self.native else 2  # a radix sort needs as much again
         self.cell_key = self._int(in_sort * count)
         self.order = self._int(in_sort * count)
         self.piece_wrap = self._int(count)
-        self.planes = wp.zeros(GEOMETRY_PLANES * self.stride, dtype=wp.float32, device=device)
+        if self.native:
+            size, stored = GEOMETRY_PLANES * self.stride, wp.float32
+        else:
+            size, stored = 2 * count, wp.vec4f
+        self.geometry = wp.zeros(size, dtype=stored, device=device)
         self.sorted_start = wp.zeros(count, dtype=p.vec3, device=device)
         self.sorted_axis = wp.zeros(count, dtype=p.vec3, device=device)
         self.sorted_segment = self._int(count)
@@ -221,6 +225,7 @@ class NeighborList:
         else:
             self.pair_key, self.pair_slot = self._int(2 * size), self._int(2 * size)
             self.in_key, self.in_pair = self._int(2 * size), self._int(2 * size)
+            self.found_j, self.found_image = self._int(size), self._int(size)
         self._drop_executor()
 
     def _drop_executor(self) -> None:
@@ -266,7 +271,8 @@ class NeighborList:
                 self._wraps = int(wrap)
                 self.wraps.fill_(self._wraps)
             if self._executor is None:
-                self._executor = Executor(list_launches(self), self.model.device, self.workers)
+                launches, device = list_launches(self), self.model.device
+                self._executor = Executor(launches, device, self.workers, single=True)
             self._executor.run(1, _never)
             status = self.state.status.numpy()
             overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])

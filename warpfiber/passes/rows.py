@@ -13,8 +13,8 @@ import warp as wp
 
 from warpfiber.laws.segment_distance import make_segment_distance
 from warpfiber.model import OVERFLOW, OVERFLOW_PAIRS, OVERFLOW_ROW, PAIR_COUNT, ROW_NEED, precision
-from warpfiber.passes.cells import NO_WRAP, WRAP_Y, WRAP_Z, ListFeatures
-from warpfiber.passes.native_search import ROUNDING
+from warpfiber.passes.cells import NO_WRAP, TINY, WRAP_Y, WRAP_Z, ListFeatures
+from warpfiber.passes.native_search import PARALLEL, ROUNDING
 
 
 @cache
@@ -27,15 +27,29 @@ def make_row_kernels(name: str, features: ListFeatures):
     pieces = features.pieces
     mask, offset_image = WRAP_Y - 1, WRAP_Y // 2
     far_away = wp.float32(1e6)
-    zero, one, half = wp.float32(0.0), wp.float32(1.0), wp.float32(0.5)
+    zero, half = wp.float32(0.0), wp.float32(0.5)
+    one, two = wp.float32(1.0), wp.float32(2.0)
     options = {"module": "unique", "enable_backward": False, "grid_stride": False}
 
     @wp.func
     def boxes(c: wp.int32, d: wp.int32) -> wp.int32:
         """Whole boxes in `c` cells, rounded down."""
         if c >= 0:
+            if c < d:
+                return 0
             return c / d
         return -((d - 1 - c) / d)
+
+    @wp.func
+    def above(x: wp.float32) -> wp.float32:
+        """x where positive, else 0: without the care of `wp.max` for NaN, one instruction."""
+        return wp.where(x > zero, x, zero)
+
+    @wp.func
+    def within_one(x: wp.float32) -> wp.float32:
+        """x between -1 and 1."""
+        low = wp.where(x > -one, x, -one)
+        return wp.where(low < one, low, one)
 
     @wp.func
     def cell_range(middle: wp.float32, reach: wp.float32, d: wp.int32, wraps: wp.bool):
@@ -69,14 +83,13 @@ def make_row_kernels(name: str, features: ListFeatures):
     @wp.kernel(**options)
     def find_pairs(
         row_capacity: wp.int32,
-        stride: wp.int32,
         sizes: wp.array(dtype=wp.float64),
         cells: wp.array(dtype=wp.vec3i),
         frame: wp.array(dtype=wp.float32),
         lattice: wp.array(dtype=wp.mat33d),
         key: wp.array(dtype=wp.int32),
         cell_start: wp.array(dtype=wp.int32),
-        planes: wp.array(dtype=wp.float32),
+        geometry: wp.array(dtype=wp.vec4f),
         start: wp.array(dtype=vec3),
         axis: wp.array(dtype=vec3),
         segment: wp.array(dtype=wp.int32),
@@ -93,23 +106,30 @@ def make_row_kernels(name: str, features: ListFeatures):
         k = wp.tid()
         d = cells[0]
         own = key[k]
-        ox = own % d[0]
-        oy = (own / d[0]) % d[1]
-        oz = own / (d[0] * d[1])
-        x = wp.vec3f(planes[k], planes[stride + k], planes[2 * stride + k])
-        a = wp.vec3f(planes[3 * stride + k], planes[4 * stride + k], planes[5 * stride + k])
-        inverse_aa = one / (wp.dot(a, a) + wp.float32(1e-30))
+        own_row = own / d[0]
+        ox = own - own_row * d[0]
+        oz = own_row / d[1]
+        oy = own_row - oz * d[1]
+        here = geometry[2 * k]
+        own_axis = geometry[2 * k + 1]
+        x = wp.vec3f(here[0], here[1], here[2])
+        a = wp.vec3f(own_axis[0], own_axis[1], own_axis[2])
+        aa = wp.dot(a, a) + wp.float32(TINY)
+        inverse_aa = own_axis[3]
         h = wp.float32(sizes[0])
         longest = half * wp.float32(sizes[1])
         size = wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
         around = h + longest + wp.float32(ROUNDING) * size
+        near = h + wp.float32(ROUNDING) * (two * around + size)
+        # what the rounding of squares as large as those of the farthest near midpoints adds
+        squares = wp.float32(PARALLEL) * (around + longest) * (around + longest) / h
         low = wp.vec3i(0, 0, 0)
         high = wp.vec3i(0, 0, 0)
         for axis_number in range(3):
             g = wp.vec3f(
                 frame[3 * axis_number], frame[3 * axis_number + 1], frame[3 * axis_number + 2]
             )
-            wide = wp.length(g)
+            wide = frame[18 + axis_number]
             # longer pieces than the cells hold are not in this list: they call for a new one
             reach = wp.min(wp.abs(wp.dot(g, a)), longest * wide)
             reach += around * wide + wp.float32(2e-3)
@@ -133,18 +153,19 @@ def make_row_kernels(name: str, features: ListFeatures):
                 ny = boxes(y, d[1])
                 row = ((z - nz * d[2]) * d[1] + y - ny * d[1]) * d[0]
                 mine = z == oz and y == oy
-                cx = low[0]
+                at = low[0]
                 if mine:
-                    cx = wp.max(cx, ox)
-                while cx <= high[0]:
-                    nx = boxes(cx, d[0])
-                    ex = cx - nx * d[0]
+                    at = wp.max(at, ox)
+                while at <= high[0]:
+                    nx = boxes(at, d[0])
+                    ex = at - nx * d[0]
                     stop = wp.min(high[0] - nx * d[0], d[0] - 1)
                     begin = cell_start[row + ex]
                     if mine and nx == 0 and ex == ox:
                         begin = k + 1
-                    cx = stop + nx * d[0] + 1
+                    at = stop + nx * d[0] + 1
                     shift = wp.vec3f(zero, zero, zero)
+                    margin = near + zero  # a copy
                     if nx != 0 or ny != 0 or nz != 0:
                         for row_number in range(3):
                             shift[row_number] = (
@@ -152,23 +173,46 @@ def make_row_kernels(name: str, features: ListFeatures):
                                 + frame[10 + 3 * row_number] * wp.float32(ny)
                                 + frame[11 + 3 * row_number] * wp.float32(nz)
                             )
-                    margin = h + wp.float32(ROUNDING) * (
-                        wp.float32(2.0) * around
-                        + size
-                        + wp.abs(shift[0])
-                        + wp.abs(shift[1])
-                        + wp.abs(shift[2])
-                    )
+                            margin += wp.float32(ROUNDING) * wp.abs(shift[row_number])
                     run = wp.static(NO_WRAP) + nx + wp.static(WRAP_Y) * ny + wp.static(WRAP_Z) * nz
-                    for m in range(begin, cell_start[row + stop + 1]):
-                        q = (
-                            wp.vec3f(planes[m], planes[stride + m], planes[2 * stride + m])
-                            + shift
-                            - x
-                        )
-                        q -= wp.clamp(wp.dot(q, a) * inverse_aa, -one, one) * a
-                        far = planes[6 * stride + m] + margin
-                        if wp.length_sq(q) > far * far:
+                    u = x - shift
+                    end = cell_start[row + stop + 1]
+                    next_piece = begin
+                    while next_piece < end:
+                        m = next_piece
+                        next_piece += 1
+                        # the distance of the midpoint from the piece, then that of the two lines,
+                        # then that of the two pieces: each rejects most of what the one before left
+                        there = geometry[2 * m]
+                        qx = there[0] - u[0]
+                        qy = there[1] - u[1]
+                        qz = there[2] - u[2]
+                        qq = qx * qx + qy * qy + qz * qz
+                        da = qx * a[0] + qy * a[1] + qz * a[2]
+                        beyond = above(wp.abs(da) - aa)
+                        far = there[3] + (margin + squares)
+                        if qq - (da * da - beyond * beyond) * inverse_aa > far * far:
+                            continue
+                        b = geometry[2 * m + 1]
+                        bb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2] + wp.float32(TINY)
+                        near2 = margin * margin + wp.float32(PARALLEL) * (aa + bb)
+                        across_x = a[1] * b[2] - a[2] * b[1]
+                        across_y = a[2] * b[0] - a[0] * b[2]
+                        across_z = a[0] * b[1] - a[1] * b[0]
+                        nn = across_x * across_x + across_y * across_y + across_z * across_z
+                        qn = qx * across_x + qy * across_y + qz * across_z
+                        if qn * qn > near2 * nn + wp.float32(PARALLEL) * qq * aa * bb:
+                            continue
+                        ab = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+                        db = qx * b[0] + qy * b[1] + qz * b[2]
+                        den = wp.max(aa * bb - ab * ab, wp.float32(1e-6) * aa * bb)
+                        s = within_one((da * bb - db * ab) / den)
+                        t = within_one((s * ab - db) * b[3])
+                        s = within_one((t * ab + da) * inverse_aa)
+                        cx = qx + t * b[0] - s * a[0]
+                        cy = qy + t * b[1] - s * a[1]
+                        cz = qz + t * b[2] - s * a[2]
+                        if cx * cx + cy * cy + cz * cz > near2:
                             continue
                         j = segment[m]
                         code = run - wrap[m] + wrap[k]
@@ -176,24 +220,24 @@ def make_row_kernels(name: str, features: ListFeatures):
                             if wp.abs(i - j) - 1 < fiber_skip[fiber]:
                                 if segment_fiber[j] == fiber:
                                     continue
-                        u = k
-                        v = m
+                        lower = k
+                        upper = m
                         if i > j or (i == j and code < wp.static(NO_WRAP)):
-                            u = m
-                            v = k
+                            lower = m
+                            upper = k
                             code = 2 * wp.static(NO_WRAP) - code
-                        delta = start[v] - start[u]
+                        delta = start[upper] - start[lower]
                         if code != wp.static(NO_WRAP):
                             delta += image_vector(lattice[0], code)
-                        st = closest_fractions(delta, axis[u], axis[v])
-                        c = delta + st[1] * axis[v] - st[0] * axis[u]
+                        st = closest_fractions(delta, axis[lower], axis[upper])
+                        c = delta + st[1] * axis[upper] - st[0] * axis[lower]
                         nearest = real(sizes[0])
                         # a distance that is not a number is no pair
                         if not (wp.length_sq(c) <= nearest * nearest):
                             continue
                         if wp.static(pieces):
                             # of all pairs of pieces only the one with the closest points reports
-                            if not (holds(st[0], part[u]) and holds(st[1], part[v])):
+                            if not (holds(st[0], part[lower]) and holds(st[1], part[upper])):
                                 continue
                         if count < row_capacity:
                             slot = k * row_capacity + count
@@ -226,32 +270,39 @@ def make_row_kernels(name: str, features: ListFeatures):
         row_count: wp.array(dtype=wp.int32),
         row_end: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
-        slot_out: wp.array(dtype=wp.int32),
+        row_i: wp.array(dtype=wp.int32),
+        row_j: wp.array(dtype=wp.int32),
+        row_image: wp.array(dtype=wp.int32),
+        key_out: wp.array(dtype=wp.int32),
+        found_j_out: wp.array(dtype=wp.int32),
+        found_image_out: wp.array(dtype=wp.int32),
     ):
         if status[wp.static(OVERFLOW)] != 0:
             return
         k = wp.tid()
         count = row_count[k]
-        for m in range(count):
-            slot_out[row_end[k] - count + m] = k * row_capacity + m
+        place = row_end[k] - count
+        for slot in range(k * row_capacity, k * row_capacity + count):
+            key_out[place] = row_i[slot]
+            found_j_out[place] = row_j[slot]
+            found_image_out[place] = row_image[slot]
+            place += 1
 
     @wp.kernel(**options)
-    def fetch_keys(
+    def number_places(
         bins: wp.int32,
-        source: wp.array(dtype=wp.int32),
-        slot: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         key_out: wp.array(dtype=wp.int32),
+        slot_out: wp.array(dtype=wp.int32),
         in_key_out: wp.array(dtype=wp.int32),
         in_pair_out: wp.array(dtype=wp.int32),
     ):
-        """Owner of every place; places beyond the last pair sort to the end of both orders."""
+        """What is sorted along; places beyond the last pair sort to the end of both orders."""
         place = wp.tid()
         in_key_out[place] = bins
+        slot_out[place] = place
         in_pair_out[place] = place
-        if status[wp.static(OVERFLOW)] == 0 and place < status[wp.static(PAIR_COUNT)]:
-            key_out[place] = source[slot[place]]
-        else:
+        if status[wp.static(OVERFLOW)] != 0 or place >= status[wp.static(PAIR_COUNT)]:
             key_out[place] = bins
 
     @wp.kernel(**options)
@@ -280,8 +331,8 @@ def make_row_kernels(name: str, features: ListFeatures):
     def fetch_pairs(
         out_start: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
-        row_j: wp.array(dtype=wp.int32),
-        row_image: wp.array(dtype=wp.int32),
+        found_j: wp.array(dtype=wp.int32),
+        found_image: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         pair_i_out: wp.array(dtype=wp.int32),
         pair_j_out: wp.array(dtype=wp.int32),
@@ -294,8 +345,8 @@ def make_row_kernels(name: str, features: ListFeatures):
         i = wp.tid()
         begin = out_start[i]
         for place in range(begin, out_start[i + 1]):
-            j = row_j[slot[place]]
-            code = row_image[slot[place]]
+            j = found_j[slot[place]]
+            code = found_image[slot[place]]
             at = place
             while at > begin:
                 other = pair_j_out[at - 1]
@@ -311,5 +362,5 @@ def make_row_kernels(name: str, features: ListFeatures):
             in_key_out[at] = j
 
     local = locals()
-    names = "find_pairs check_capacity compact_rows fetch_keys mark_starts fetch_pairs"
+    names = "find_pairs check_capacity compact_rows number_places mark_starts fetch_pairs"
     return {kernel: local[kernel] for kernel in names.split()}

@@ -1,39 +1,72 @@
-"""Threads that replay graphs side by side on the CPU, and how they hand over to one another.
+"""Threads that replay graphs side by side on the CPU, and how they wait for one another.
 
-A phase is one graph per worker, or a loop of phases while a word says so. Locks decide who may go
-on; because waking a sleeping thread takes longer than many a phase, a thread that waits first looks
-at a ticket for some microseconds in a native loop, which leaves the interpreter to the others. The
-ticket only says when to look at the lock; it decides nothing.
+Every worker replays one graph, the same steps over its own part of every launch. Inside the graphs
+a barrier stands where one worker reads what another wrote: a native loop over one count per worker,
+which gives its core away when that takes long (two workers may share a core). Between graphs locks
+decide who may go on; because waking a sleeping thread takes longer than many a step, a thread that
+waits first looks at a ticket for some microseconds in a native loop, which leaves the interpreter
+to the others. The ticket only says when to look at the lock; it decides nothing.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, TypeAlias
+from typing import Any
 
 import warp as wp
 
-LOOKS = 4000  # some 50 us; longer waits sleep
-LINE = 16  # tickets are this far apart: a cache line each
+LOOKS = 4000  # some 50 us; longer waits sleep, or give the core away
+LINE = 16  # counts of workers are this far apart: a cache line each
 
-
-@wp.func_native("""
-    const volatile int* ticket = tickets.data + slot;
-    const int before = seen.data[slot];
-    for (int look = 0; look < looks && *ticket == before; ++look) {
+PAUSE = """
 #if defined(__x86_64__) || defined(__i386__)
         __builtin_ia32_pause();
 #endif
-    }
+"""
+
+
+@wp.func_native(f"""
+    const volatile int* ticket = tickets.data + slot;
+    const int before = seen.data[slot];
+    for (int look = 0; look < looks && *ticket == before; ++look) {{
+        {PAUSE}
+    }}
 """)
 def _look(
     slot: wp.int32,
     looks: wp.int32,
     seen: wp.array(dtype=wp.int32),
     tickets: wp.array(dtype=wp.int32),
+): ...
+
+
+# Counts never go back; their difference tells who is behind, also once they overflow.
+@wp.func_native(f"""
+    typedef void (*call_t)();
+    int* const arrived = counts.data;
+    const unsigned mine = (unsigned)arrived[{LINE} * worker] + 1u;
+    __atomic_store_n(arrived + {LINE} * worker, (int)mine, __ATOMIC_RELEASE);
+    for (int other = 0; other < workers; ++other)
+        for (int look = 0;; ++look) {{
+            const int there = __atomic_load_n(arrived + {LINE} * other, __ATOMIC_ACQUIRE);
+            if ((int)((unsigned)there - mine) >= 0) break;
+            {PAUSE}
+            if (look >= looks) {{
+                look = looks;
+                if (give_way != 0) ((call_t)give_way)();
+            }}
+        }}
+""")
+def _meet(
+    worker: wp.int32,
+    workers: wp.int32,
+    looks: wp.int32,
+    give_way: wp.uint64,
+    counts: wp.array(dtype=wp.int32),
 ): ...
 
 
@@ -51,6 +84,44 @@ def wait_kernel() -> Any:
         _look(slot, looks, seen, tickets)
 
     return wait
+
+
+@cache
+def meet_kernel() -> Any:
+    """Kernel (one thread): return when every worker has come here as often as this one."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def meet(
+        worker: wp.int32,
+        workers: wp.int32,
+        looks: wp.int32,
+        give_way: wp.uint64,
+        counts: wp.array(dtype=wp.int32),
+    ):
+        _meet(worker, workers, looks, give_way, counts)
+
+    return meet
+
+
+@cache
+def give_way_address() -> int:
+    """Address of the system's function that lets another thread have the core; 0 without."""
+    library = getattr(ctypes, "windll").kernel32 if os.name == "nt" else ctypes.CDLL(None)  # noqa: B009
+    function = getattr(library, "SwitchToThread" if os.name == "nt" else "sched_yield", None)
+    return ctypes.cast(function, ctypes.c_void_p).value or 0 if function is not None else 0
+
+
+class Barrier:
+    """Where all workers meet; `record` is part of the graph of every one of them."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self.counts = wp.zeros(LINE * workers, dtype=wp.int32, device="cpu")
+
+    def record(self, worker: int) -> None:
+        """This worker goes on when all others are here."""
+        inputs = [worker, self.workers, LOOKS, wp.uint64(give_way_address()), self.counts]
+        wp.launch(meet_kernel(), dim=1, inputs=inputs, device="cpu")
 
 
 class _Gate:
@@ -76,24 +147,15 @@ class _Gate:
         self.seen[self.slot] += 1
 
 
-@dataclass
-class Loop:
-    """Phases that repeat while `going[0]` is not 0."""
-
-    phases: list[Phase]
-    going: Any  # int32, view of what the phases write
-
-
-# The graph of every worker, or None where it has nothing to do.
-Phase: TypeAlias = "list[Any] | Loop"
-
-
 class Workers:
-    """Threads that replay their graph of a phase when told to; the caller is worker 0."""
+    """Threads that replay their graph when told to; the caller is worker 0.
 
-    def __init__(self, phases: list[Phase], workers: int) -> None:
-        self.phases = phases
-        self.phase: list[Any] | None = None
+    `graphs`: by number of steps, the graph of every worker; one step is among them.
+    """
+
+    def __init__(self, graphs: Mapping[int, list[Any]], workers: int) -> None:
+        self.graphs = graphs
+        self.current: list[Any] | None = None
         tickets = wp.zeros(2 * LINE * workers, dtype=wp.int32, device="cpu")
         seen = wp.zeros(2 * LINE * workers, dtype=wp.int32, device="cpu")
         self._arrays = tickets, seen
@@ -109,40 +171,27 @@ class Workers:
         go, done = self.go[worker - 1], self.done[worker - 1]
         while True:
             go.wait()
-            if self.phase is None:
+            if self.current is None:
                 return
-            graph = self.phase[worker]
-            if graph is not None:
-                wp.capture_launch(graph)
+            wp.capture_launch(self.current[worker])
             done.open()
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
-        """Replay all phases up to `steps` times, looking at `halted` before each."""
-        for _ in range(steps):
-            if halted():
-                return
-            self._replay(self.phases)
-
-    def _replay(self, phases: list[Phase]) -> None:
-        for phase in phases:
-            if isinstance(phase, Loop):
-                while phase.going[0] != 0:
-                    self._replay(phase.phases)
-                continue
-            if all(graph is None for graph in phase[1:]):
-                wp.capture_launch(phase[0])
-                continue
-            self.phase = phase
+        """Take up to `steps` steps, looking at `halted` before each graph."""
+        most = max(self.graphs)
+        while steps > 0 and not halted():
+            taken = most if steps >= most else 1
+            self.current = self.graphs[taken]
             for gate in self.go:
                 gate.open()
-            if phase[0] is not None:  # fewer items than workers: the last ones have them
-                wp.capture_launch(phase[0])
+            wp.capture_launch(self.current[0])
             for gate in self.done:
                 gate.wait()
+            steps -= taken
 
     def close(self) -> None:
         """End the threads."""
-        self.phase = None
+        self.current = None
         for gate in self.go:
             gate.open()
         for thread in self.threads:

@@ -22,7 +22,7 @@ from warpfiber.placement.layers import Drawn, Stack, draw_fibers
 from warpfiber.placement.lengths import averages
 from warpfiber.placement.orientations import orientation_tensor, values_from_tensor
 from warpfiber.placement.parts import table_law
-from warpfiber.placement.slices import layer_averages, slices, votes
+from warpfiber.placement.slices import largest_a33, layer_averages, slices, votes
 from warpfiber.placement.space import Cell
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError
 
@@ -205,6 +205,14 @@ def population_report(scene: Scene, population: Population, strains: Floats) -> 
     volume = sum(g.volume_fraction_achieved or 0.0 for _, g in population.groups)
     fraction = volume * cut.length / cut.length.sum() * stack.edges[-1] / np.diff(stack.edges)
     l_n, l_w = averages(population.length)
+    # who has to fit where: a fiber that spans layers only has to fit between the walls
+    gap = np.diff(stack.edges) if stack.inside else np.full(len(stack), stack.edges[-1])
+    if not (stack.inside or population.cell.wall[2]):
+        gap = np.full(len(stack), np.inf)
+    steepest = []
+    for k in range(len(stack)):
+        mine = population.length[home == k] if stack.inside else population.length
+        steepest.append(largest_a33(mine, 2.0 * population.radius, float(gap[k])))
     report: dict[str, Any] = {
         "table": population.table,
         "groups": len(population.groups),
@@ -240,11 +248,26 @@ def population_report(scene: Scene, population: Population, strains: Floats) -> 
                 },
                 "number_average_length": mean[k][0],
                 "weight_average_length": mean[k][1],
+                "largest_a33": {"by_number": steepest[k][0], "by_length": steepest[k][1]},
             }
             for k in range(len(stack))
         ]
     report["missed"] = _missed(stack, by_number if stack.inside else cut.tensor, fraction, volume)
+    report["missed"] += _beyond_reach(stack, [pair[0 if stack.inside else 1] for pair in steepest])
     return report
+
+
+def _beyond_reach(stack: Stack, most: list[float]) -> list[str]:
+    """Layers that ask for steeper fibers than fit, one line each; `most`: their largest a33."""
+    lines = []
+    for k, (tensor, largest) in enumerate(zip(stack.tensor, most, strict=True)):
+        if tensor[2, 2] > largest:
+            name = f"layer {k}: " if len(stack) > 1 else ""
+            lines.append(
+                f"{name}a33 = {tensor[2, 2]:.4f} cannot be reached: straight fibers of these "
+                f"lengths fit with at most {largest:.4f}"
+            )
+    return lines
 
 
 def _missed(stack: Stack, tensor: Floats, fraction: Floats, volume: float) -> list[str]:

@@ -56,3 +56,14 @@ def layer_averages(length: Floats, layer: Ints, count: int) -> list[tuple[float,
     return [
         averages(length[layer == k]) if np.any(layer == k) else (0.0, 0.0) for k in range(count)
     ]
+
+
+def largest_a33(length: Floats, diameter: float, gap: float) -> tuple[float, float]:
+    """Most that a33 can be, by number and by length, of straight fibers (n,) m between two planes.
+
+    A fiber of length L tip to tip fits a gap h if |p_z| <= (h - d)/(L - d); 0 without fibers.
+    """
+    if not len(length):
+        return 0.0, 0.0
+    steepest = np.clip((gap - diameter) / np.maximum(length - diameter, 1e-300), 0.0, 1.0) ** 2
+    return float(steepest.mean()), float(length @ steepest / length.sum())

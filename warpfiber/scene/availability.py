@@ -25,44 +25,27 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
-    Row("stage", "control", ("displacement",), 'use control = "displacement" and end_pressure'),
-    Row("stage", "pressure_rate", (), "remove it; the wall moves at speed"),
-    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
                                  "curvature", "stress"),
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity",), "remove the others from the list"),
     Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
-    Row("start", "", (), "remove the table and give [[fibers]]"),
 )  # fmt: skip
 
 
 STRAIGHT = Row("shape", "kind", ("straight",),
                'fibers of this method are straight at rest; use kind = "straight", '
                "or node_file to start from another form")  # fmt: skip
+IN_FLOW = ("orientation", "orientation4", "contacts", "overlap", "interactions", "axial_strain",
+           "energy", "rotation", "curvature")  # fmt: skip
 FLOWING = (
     STRAIGHT,
     Row("stage", "kind", ("flow",), 'use kind = "flow"; "settle" is of method bonded_spheres'),
     Row("stage", "end_speed", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_volume_fraction", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_pressure", (), "end the stage by end_strain or end_time"),
-    Row(
-        "record",
-        "quantities",
-        (
-            "orientation",
-            "orientation4",
-            "contacts",
-            "overlap",
-            "interactions",
-            "axial_strain",
-            "energy",
-            "rotation",
-            "curvature",
-        ),
-        "remove it from the list; it is of method bonded_spheres",
-    ),
+    Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
 )
@@ -78,15 +61,20 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
             'use law = "exponential", or method = "overdamped"'),
         Row("numerics", "contact", ("penalty",),
             'use contact = "penalty", or method = "overdamped"'),
+        Row("record", "quantities", IN_FLOW, 'remove it, or use method = "overdamped" for stress'),
     ),
     "overdamped": (
         *FLOWING,
         SOFT,
+        Row("record", "quantities", (*IN_FLOW, "stress"),
+            "remove it from the list; it is of method bonded_spheres"),
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "rigid_rod": (
         *FLOWING,
         SOFT,
+        Row("record", "quantities", (*IN_FLOW, "stress"),
+            "remove it from the list; it is of method bonded_spheres"),
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (

@@ -17,6 +17,7 @@ from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
+from warpfiber.scene.starting import check_saving
 from warpfiber.scene.tables import strain_rate
 
 AXES = "xyz"
@@ -49,15 +50,12 @@ def cross_check(draft: Draft) -> None:
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)
+    check_saving(draft)
 
 
 def _check_tables(draft: Draft) -> None:
     """Ask for the tables that a scene, or its method, cannot do without."""
-    if draft.start is not None:
-        for name in ("fibers", "box"):
-            if draft.is_given(name):
-                draft.faults.add(name, None, "given together with [start]; [start] brings it")
-    elif not draft.fibers and not draft.faulty("fibers"):
+    if draft.start is None and not draft.fibers and not draft.faulty("fibers"):
         draft.faults.add("fibers", None, "missing; add at least one [[fibers]]")
     if not draft.stages and not draft.faulty("stage"):
         draft.faults.add("stage", None, 'missing; add a [[stage]] with kind = "flow"')
@@ -327,6 +325,10 @@ def _check_rest(draft: Draft) -> None:
 
 
 def _check_record(draft: Draft) -> None:
-    """Layers are slices of a box."""
-    if draft.record["layers"] and draft.box is None and draft.start is None:
+    """Layers are slices of a box, and stress is force over its faces."""
+    if draft.box is not None or draft.start is not None:
+        return
+    if draft.record["layers"]:
         draft.blame("record.layers", "layers are slices of a box; add [box], or remove it")
+    if "stress" in (draft.record["quantities"] or ()) and draft.method in INERTIALESS:
+        draft.blame("record.quantities", "stress is that of a box; add [box], or remove stress")

@@ -9,6 +9,7 @@ from typing import Any
 
 from warpfiber.scene.faults import FaultList
 from warpfiber.scene.keys import Values, dotted
+from warpfiber.scene.scene import Scene
 from warpfiber.scene.tables import Flow
 
 
@@ -33,6 +34,8 @@ class Draft:
     record: Values = field(default_factory=dict)
     numerics: Values = field(default_factory=dict)
     flow_object: Flow | None = None
+    saved: Scene | None = None
+    """of the run that [start] names"""
 
     def raw_value(self, key: str) -> Any:
         """Return what the file says at a dotted key, None if nothing."""

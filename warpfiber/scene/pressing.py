@@ -29,7 +29,8 @@ def pressed_axis(scene: Scene) -> int:
         if stage.kind in PRESSING and stage.wall is not None:
             return WALL_NAMES.index(stage.wall) // 2
     walls = [] if scene.box is None else [k for k in range(3) if scene.box.boundary[k] == "wall"]
-    return walls[-1] if walls and "stress" in scene.record.quantities else -1
+    metered = "stress" in scene.record.quantities or any(stage.save for stage in scene.stages)
+    return walls[-1] if walls and metered else -1
 
 
 def passing_time(draft: Draft, stage: Values) -> float | None:
@@ -39,6 +40,14 @@ def passing_time(draft: Draft, stage: Values) -> float | None:
     axis = WALL_NAMES.index(stage["wall"]) // 2
     edges = dict(draft.axes("wall"))
     return edges[axis] / stage["speed"] if axis in edges else None
+
+
+def loading_time(draft: Draft, stage: Values) -> float | None:
+    """Seconds in which a plate passes through the box and is loaded to `end_pressure`."""
+    longest, rate, end = passing_time(draft, stage), stage["pressure_rate"], stage["end_pressure"]
+    if longest is None or not rate or not end or stage["kind"] != "compress":
+        return None
+    return longest + float(end / rate)
 
 
 def check_pressing(draft: Draft) -> None:
@@ -98,9 +107,14 @@ def _check_reached(draft: Draft, stage: Values, path: str, filled: float) -> Non
             draft.blame(key, f"the whole box has {now} already; give more")
         else:
             draft.blame(key, f"never reached: the whole box has {now}; give more")
+    if draft.is_given(f"{path}.pressure_rate") and stage["control"] == "displacement":
+        remedy = 'without effect on a wall that moves at speed; add control = "load", or remove it'
+        draft.blame(f"{path}.pressure_rate", remedy)
     if stage["end_pressure"] == 0.0 and inwards:
         draft.blame(f"{path}.end_pressure", "met from the start; give a pressure above 0")
     longest = passing_time(draft, stage)
+    if stage["control"] == "load":
+        return
     if stage["end_time"] is None or longest is None or any(stage[key] for key in PRESS_ENDS):
         return
     if stage["end_time"] > longest:

@@ -32,7 +32,8 @@ from warpfiber.scene.schema import (
     TOP,
     WALL,
 )
-from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape
+from warpfiber.scene.starting import take_start
+from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape, Start
 
 T = TypeVar("T")
 TOML_PLACE = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
@@ -134,6 +135,8 @@ def _scene(
 def _checked(tables: dict[str, Any], faults: FaultList, folder: Path) -> Draft:
     """Read, complete and check the tables."""
     draft = _draft(tables, faults, folder)
+    if draft.start is not None and draft.saved is None:
+        return draft  # without fibers and box all else would be at fault, too
     resolve(draft)
     cross_check(draft)
     return draft
@@ -160,6 +163,7 @@ def _draft(raw: dict[str, Any], faults: FaultList, folder: Path) -> Draft:
     draft.start = _one(reader, START, raw, optional=True)
     draft.stages = _many(reader, STAGE, raw)
     draft.record = _one(reader, RECORD, raw) or {}
+    take_start(draft)
     return draft
 
 
@@ -241,15 +245,20 @@ def _finished(
 ) -> Scene:
     """Return the scene of a draft without faults."""
     assert draft.flow is None or draft.flow_object is not None
+    saved, start = draft.saved, draft.start
     return Scene(
         title=draft.top["title"],
         seed=draft.top["seed"],
         box=_made(Box, draft.box) if draft.box is not None else None,
+        start=_made(Start, start | {"from_": start["from"]}) if start is not None else None,
         flow=draft.flow_object,
-        fibers=tuple(
+        fibers=saved.fibers
+        if saved is not None
+        else tuple(
             _made(FiberGroup, group | {"shape": _made(Shape, group["shape"])})
             for group in draft.fibers
         ),
+        walls=saved.walls if saved is not None else (),
         contact=_made(Contact, draft.contact),
         gravity=_made(Gravity, draft.gravity) if draft.gravity is not None else None,
         loads=tuple(_made(Load, load) for load in draft.loads),

@@ -13,7 +13,7 @@ from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, strain_time
 from warpfiber.scene.keys import Values
-from warpfiber.scene.pressing import PRESSING, passing_time
+from warpfiber.scene.pressing import PRESSING, loading_time, passing_time
 from warpfiber.scene.statistics import resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
@@ -34,13 +34,14 @@ ROUNDING = 1e-9
 def resolve(draft: Draft) -> None:
     """Complete all tables of the draft; faults go to its list."""
     _resolve_flow(draft)
-    for index, group in enumerate(draft.fibers):
+    for index, group in enumerate(draft.fibers if draft.saved is None else ()):
         resolve_lengths(draft, group, f"fibers.{index}")
         resolve_layers(draft, group, f"fibers.{index}")
         _resolve_length(draft, group, f"fibers.{index}")
         _resolve_group(draft, group, f"fibers.{index}")
         _resolve_count(draft, group, f"fibers.{index}")
-    _resolve_segments(draft)
+    if draft.saved is None:
+        _resolve_segments(draft)
     _resolve_contact(draft)
     _resolve_stages(draft)
     record = draft.record
@@ -265,7 +266,8 @@ def _resolve_stages(draft: Draft) -> None:
             stage["name"] = stage["kind"]
         ended = any(draft.is_given(f"stage.{index}.{key}") for key in ("end_strain", "end_time"))
         if stage["time_limit"] is None and not ended:
-            stage["time_limit"] = passing_time(draft, stage) or 100.0
+            longest = loading_time if stage["control"] == "load" else passing_time
+            stage["time_limit"] = longest(draft, stage) or 100.0
         if stage["kind"] in PRESSING and stage["control"] is None:
             stage["control"] = "displacement"
         seconds = strain_time(stage)

@@ -51,9 +51,11 @@ class Stage:
     wall: str | None = None
     """of the box, that moves in compress and unload: z+ and the like"""
     speed: float | None = None
-    """m/s, of that wall, or of the upper grip"""
+    """m/s, of that wall (under a load at most), or of the upper grip"""
     control: str | None = None
-    """displacement"""
+    """displacement; load: the pressure on the wall changes at `pressure_rate`"""
+    pressure_rate: float | None = None
+    """Pa/s"""
     damping: float = 0.0
     """1/s on the velocities of the nodes, of `settle`"""
     freeze_below: float | None = None

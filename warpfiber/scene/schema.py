@@ -249,7 +249,7 @@ STAGE = Table(
         Key("wall", Text("the name of a wall"), required=True, when=("kind", PRESS)),
         Key("speed", Number("m/s", above=0), required=True, when=("kind", PRESS + DRAG)),
         Key("control", Choice(("displacement", "load")), when=("kind", PRESS)),
-        Key("pressure_rate", Number("Pa/s", above=0), when=("kind", PRESS)),
+        Key("pressure_rate", Number("Pa/s", above=0), required=True, when=("control", ("load",))),
         Key("damping", Number("1/s", least=0), default=0.0, when=("kind", ("settle", "pour"))),
         Key("interval", Number("s", least=0), default=0.0, when=("kind", ("pour",))),
         Key("freeze_below", Number("m"), required=True, when=("kind", DRAG)),
