@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -15,7 +14,8 @@ from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
 from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
-from warpfiber.passes.native_capsules import capsule_chunks, make_native_capsule_pairs
+from warpfiber.passes.native_capsules import make_native_capsule_pairs
+from warpfiber.passes.native_capsules_source import LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
 
 REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
@@ -160,6 +160,8 @@ class NativeBonds:
         self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
+        size = PARTS * model.node_count * LINE
+        self.contact_load = wp.zeros(size, dtype=p.real, device=device)
 
     def launch(self, phase: int) -> Launch:
         """What `phase` says: sums of LOADS, END and BEGIN."""
@@ -187,15 +189,7 @@ class NativeBonds:
             spheres.holds.hold,
             spheres.holds.load,
             spheres.grips.node_grip,
-            pairs.out_start,
-            pairs.in_start,
-            pairs.in_pair,
-            pairs.pair_i,
-            pairs.pair_j,
-            contacts.acts,
-            contacts.force,
-            contacts.moment,
-            contacts.arms,
+            self.contact_load,
             self.touches,
             self.push,
             self.couple,
@@ -215,14 +209,14 @@ class NativeBonds:
         kernel = make_native_bond_sweep(p.name, spheres.features)
         return Launch("bonds", kernel, self.block_own.shape[0], inputs, split=True)
 
-    def pair_launch(self, dt: float) -> Launch:
-        """What all listed pairs do; memories of friction move on by dt."""
+    def pair_launch(self, dt: float, *, keeps: bool = False) -> Launch:
+        """What all listed pairs do; `keeps`: also by pair, for those who read it."""
         spheres, contacts = self.spheres, self.spheres.contacts
         model, state, p = spheres.model, spheres.state, spheres.model.precision
         assert contacts is not None
-        pairs, chunks = contacts.search.list, capsule_chunks(model.segment_count)
+        pairs = contacts.search.list
         inputs = [
-            chunks,
+            wp.int32(keeps),
             p.real(dt),
             p.real(spheres.scene.contact.damping),
             p.real(spheres.scene.contact.friction),
@@ -247,10 +241,11 @@ class NativeBonds:
             contacts.arms,
             contacts.memory,
             contacts.written,
+            self.contact_load,
             state.status,
         ]
         kernel = make_native_capsule_pairs(p.name, contacts.features)
-        return Launch("pairs", kernel, chunks, inputs, split=True)
+        return Launch("pairs", kernel, PARTS, inputs, split=True)
 
     def kernels(self) -> list[Any]:
         """What a step launches."""
@@ -259,17 +254,16 @@ class NativeBonds:
         launches += self.spheres.grips.meter()
         return [launch.kernel for launch in launches]
 
-    def steps(self, halted: Callable[[], bool]) -> JoinedSteps:
+    def steps(self) -> JoinedSteps:
         """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick."""
         spheres = self.spheres
-        clock, pairs = clock_launch(spheres), self.pair_launch(spheres.dt)
+        clock, dt = clock_launch(spheres), spheres.dt
         motion = spheres.press.motion()
         meter = [*spheres.press.meter(), *spheres.grips.meter()]
         drift = self.launch(BEGIN)
         drift.name = "drift"
-        middle = [pairs, clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
-        end = [pairs, self.launch(LOADS | END), *meter]
-        model = spheres.model
-        return JoinedSteps(
-            [clock, *motion, drift], middle, end, model.device, spheres.workers, halted
-        )
+        begin = [clock, *motion, drift]
+        middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
+        end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END), *meter]
+        device, status = spheres.model.device, spheres.state.status
+        return JoinedSteps(begin, middle, end, device, spheres.workers, status)

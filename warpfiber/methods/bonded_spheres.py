@@ -198,7 +198,7 @@ class BondedSpheres(Method):
     def _prepare_steps(self, kernels: list[Any]) -> None:
         if self.executor is None and self.native is not None:
             load_kernels([*self.native.kernels(), *kernels], self.model.device)
-            self.executor = self.native.steps(self._halted)
+            self.executor = self.native.steps()
         super().prepare(kernels)
 
     def _rates(self) -> Launch:

@@ -30,9 +30,8 @@ FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
     list_sizes stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
-    node_grip out_start in_start in_pair pair_i pair_j pair_acts pair_force pair_moment pair_arms
-    node_touches node_push node_couple list_pos place node_pos node_velocity node_turn node_spin
-    node_rate node_spin_rate still_steps status block_fiber block_own
+    node_grip contact_load node_touches node_push node_couple list_pos place node_pos node_velocity
+    node_turn node_spin node_rate node_spin_rate still_steps status block_fiber block_own
 """.split()
 
 
@@ -76,15 +75,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
-        out_start: wp.array(dtype=wp.int32),
-        in_start: wp.array(dtype=wp.int32),
-        in_pair: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
-        pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
-        pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
-        pair_arms: wp.array(dtype=vec4),
+        contact_load: wp.array(dtype=real),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
@@ -149,15 +140,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
-        out_start: wp.array(dtype=wp.int32),
-        in_start: wp.array(dtype=wp.int32),
-        in_pair: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
-        pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
-        pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
-        pair_arms: wp.array(dtype=vec4),
+        contact_load: wp.array(dtype=real),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
@@ -233,15 +216,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             node_hold,
             node_load,
             node_grip,
-            out_start,
-            in_start,
-            in_pair,
-            pair_i,
-            pair_j,
-            pair_acts,
-            pair_force,
-            pair_moment,
-            pair_arms,
+            contact_load,
             node_touches,
             node_push,
             node_couple,

@@ -12,10 +12,9 @@ import math
 from warpfiber.laws.rotation import LARGEST_HALF_ANGLE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
-from warpfiber.passes.native import lane_types, transfers
+from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-
-LANES = 8  # fibers, in both precisions
+from warpfiber.passes.native_capsules_source import LANES, LINE, PARTS
 
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
@@ -49,6 +48,8 @@ def _constants(features: BondFeatures) -> str:
         "IS_FREE": FREE,
         "IS_CLAMPED": CLAMPED,
         "IS_LOWER": LOWER,
+        "LINE": LINE,
+        "PARTS": PARTS,
         "LOADS": LOADS,
         "END": END,
         "BEGIN": BEGIN,
@@ -57,37 +58,25 @@ def _constants(features: BondFeatures) -> str:
     return "\n".join(lines)
 
 
-# Loads of pairs, fiber by fiber: few nodes have any.
+# Loads of contacts: the parts of the pair sweep in turn, cleared for the next one.
 _GATHER = """
-    for (int c = 0; c < 3 * nodes; ++c) a[c] = b[c] = V(T(0));
-    if constexpr (HAS_PAIRS) {
-        auto add = [&](int l, int k, int segment, T sign, T share, T arm) {
-            T* to_a = (T*)(a + 3 * segment) + l;
-            T* to_b = (T*)(b + 3 * segment) + l;
-            const T* force = (const T*)pair_force + 3 * k;
-            const T* moment = (const T*)pair_moment + 3 * k;
-            #pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                const T push = sign * force[c], couple = arm * moment[c];
-                const T second_push = share * push, second_couple = share * couple;
-                to_a[c * W] += push - second_push;
-                to_a[(3 + c) * W] += second_push;
-                to_b[c * W] += couple - second_couple;
-                to_b[(3 + c) * W] += second_couple;
-            }
-        };
-        const T* arms = (const T*)pair_arms;
-        for (int l = 0; l < own; ++l) {
-            const int begin = first[l] - fiber[l];
-            const int end = begin + segments;
-            for (int k = out_start[begin]; k < out_start[end]; ++k)
-                if (pair_acts[k])
-                    add(l, k, pair_i[k] - begin, T(1), arms[4 * k], arms[4 * k + 2]);
-            for (int slot = in_start[begin]; slot < in_start[end]; ++slot) {
-                const int k = in_pair[slot];
-                if (pair_acts[k])
-                    add(l, k, pair_j[k] - begin, T(-1), arms[4 * k + 1], arms[4 * k + 3]);
-            }
+    const long part = (long)LINE * node_count;
+    for (int k = 0; k < nodes; ++k) {
+        V r[W];
+        #pragma unroll
+        for (int l = 0; l < W; ++l) {
+            const T* from = contact_load + (long)LINE * (first[l] + k);
+            r[l] = *(const U*)from;
+            for (int p = 1; p < PARTS; ++p) r[l] += *(const U*)(from + p * part);
+        }
+        for (int l = 0; l < own; ++l)
+            for (int p = 0; p < PARTS; ++p)
+                *(U*)(contact_load + (long)LINE * (first[l] + k) + p * part) = V(T(0));
+        TRANSPOSE
+        #pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            a[3 * k + c] = r[c];
+            b[3 * k + c] = r[3 + c];
         }
     }
 """
@@ -286,13 +275,16 @@ _LOAD = """
 def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
-    work = _LOAD.replace("GATHER", _GATHER).replace("BONDS", BONDS + _RATES)
+    work = _LOAD.replace("GATHER", _GATHER.replace("TRANSPOSE", transpose(LANES))).replace(
+        "BONDS", BONDS + _RATES
+    )
     work += _MOVE.replace("HOLD", _HOLD) + _STORE
     types = lane_types(name, LANES)
     places = "auto& load_P = load_V; auto& store_P = store_V;"
     if name == "float32":
         places = transfers("P", LANES)
     return f"""
+    const int node_count = place.shape[0];
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {types}

@@ -1,7 +1,9 @@
 """The pair sweep of bonded spheres on the CPU: distances and contacts of eight pairs at a time.
 
-A pair is a lane; nothing in a lane depends on the others, so it does not matter how the list is cut
-into parts for launch indices and workers.
+A pair is a lane, and nothing in a lane depends on the others. The list is cut into PARTS; each adds
+the loads of its contacts to a line of numbers per node of its own, which the sweep over bonds adds
+up in turn, so a sum does not depend on the number of workers. What a pair does is stored by pair
+only if asked for: most of the time would go into that.
 
 Limits: CPU only (clang vector types), else `capsule_pairs`; multiplications and additions are
     fused and powers are by series: equal to rounding.
@@ -16,31 +18,25 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
 from warpfiber.passes.native_capsules_source import capsule_sweep_source
 
-CHUNK_SEGMENTS = 128  # segments per launch index
 # Arguments of the sweep that are arrays.
 ARRAYS = """
     groups fiber_node_start fiber_group segment_node segment_fiber lattice out_start pair_i pair_j
     pair_image place node_velocity node_spin step pair_acts pair_force pair_moment pair_arms
-    pair_memory pair_step status
+    pair_memory pair_step contact_load status
 """.split()
-
-
-def capsule_chunks(segment_count: int) -> int:
-    """Launch dimension of the sweep; every index takes an equal share of the list."""
-    return max(1, segment_count // CHUNK_SEGMENTS)
 
 
 @cache
 def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
-    """Kernel `native_capsule_pairs` over `chunks` parts of the list."""
+    """Kernel `native_capsule_pairs` over the PARTS of the list."""
     p = precision(name)
     real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
 
     @wp.func_native(capsule_sweep_source(name, features, ARRAYS))
-    def sweep_chunk(
-        chunk: wp.int32,
-        chunks: wp.int32,
+    def sweep_part(
+        part: wp.int32,
+        keeps: wp.int32,
         dt: real,
         beta: real,
         friction: real,
@@ -65,13 +61,14 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_arms: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
+        contact_load: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def native_capsule_pairs(
         offset: wp.int32,
-        chunks: wp.int32,
+        keeps: wp.int32,
         dt: real,
         beta: real,
         friction: real,
@@ -96,11 +93,12 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_arms_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
+        contact_load: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
     ):
-        sweep_chunk(
+        sweep_part(
             wp.tid() + offset,
-            chunks,
+            keeps,
             dt,
             beta,
             friction,
@@ -125,6 +123,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             pair_arms_out,
             pair_memory,
             pair_step,
+            contact_load,
             status,
         )
 

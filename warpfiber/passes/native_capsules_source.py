@@ -9,11 +9,13 @@ Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list.
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
-from warpfiber.passes.native import lane_types
+from warpfiber.passes.native import lane_types, transpose
 from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
 from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE
 
-LANES = 8  # pairs, in both precisions
+LANES = 8  # pairs, and fibers of `native_bonds`, in both precisions
+PARTS = 2  # of the list; as many workers share a sweep
+LINE = 8  # numbers per node and part: force, moment, two unused
 
 
 def _constants(name: str, features: CapsuleFeatures) -> str:
@@ -26,6 +28,8 @@ def _constants(name: str, features: CapsuleFeatures) -> str:
     lines = [f"constexpr bool {key} = {str(value).lower()};" for key, value in flags.items()]
     lines.append(f"constexpr T DASHPOT = T({DASHPOT!r}), EPS = T({precision(name).eps!r});")
     numbers = {
+        "PARTS": PARTS,
+        "LINE": LINE,
         "SLOT_HALT": HALT,
         "SLOT_COUNT": PAIR_COUNT,
         "NO_IMAGE": NO_IMAGE,
@@ -162,7 +166,11 @@ _LAW = """
             numbers[11][l] = first_j && !gj.closed ? gj.end_mass : gj.mass;
             numbers[12][l] = last_j && !gj.closed ? gj.end_mass : gj.mass;
         }
-        auto number = [&](int n) -> V { V v; __builtin_memcpy(&v, numbers[n], sizeof(V)); return v; };
+        auto number = [&](int n) -> V {
+            V v;
+            __builtin_memcpy(&v, numbers[n], sizeof(V));
+            return v;
+        };
         const V3 a = narrow(rows_a), b = narrow(rows_b);
         V3 delta = narrow(rows_d);
         add_images(ks, delta);
@@ -177,7 +185,10 @@ _LAW = """
         __builtin_memcpy(&t, ts, sizeof(V));
         NORMAL
         const M acts = force > T(0);
-        if (!any(acts)) return;
+        typedef bool B __attribute__((ext_vector_type(W)));
+        const B bits = __builtin_convertvector(acts, B);
+        const unsigned mine = __builtin_bit_cast(unsigned char, bits) & ((1u << count) - 1u);
+        if (mine == 0) return;
 
         const V3 c = delta + b * t - a * s;
         const V distance = root(c.dot(c));
@@ -213,19 +224,22 @@ _LAW = """
                 const V turn = T(0.5) * dt * (wi + wj).dot(n);
                 const V far_i = la * smaller(s, rest_s), far_j = lb * smaller(t, rest_t);
                 T kept[4][W];
-                for (int l = 0; l < W; ++l) {
+                __builtin_memset(kept, 0, sizeof(kept));
+                for (unsigned left = mine; left != 0; left &= left - 1) {
+                    const int l = __builtin_ctz(left);
                     int from = ks[l];
-                    if (!acts[l]) from = -1;
-                    else if (written_last[from] != last) {
+                    if (__builtin_expect(written_last[from] != last, 0)) {
                         const int i = pair_i[from], j = pair_j[from];
-                        const int on_i = s[l] < T(0.5) ? (tip0_i[l] ? i : i - 1)
-                                                       : (tip1_i[l] ? i : i + 1);
-                        const int on_j = t[l] < T(0.5) ? (tip0_j[l] ? j : j - 1)
-                                                       : (tip1_j[l] ? j : j + 1);
-                        from = neighbors_memory(from, on_i, on_j, far_i[l], far_j[l]);
+                        const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
+                        const int to_i = s_l < T(0.5) ? -(numbers[0][l] == T(0))
+                                                      : (numbers[1][l] == T(0));
+                        const int to_j = t_l < T(0.5) ? -(numbers[2][l] == T(0))
+                                                      : (numbers[3][l] == T(0));
+                        from = neighbors_memory(
+                            from, i + to_i, j + to_j, ((const T*)&far_i)[l], ((const T*)&far_j)[l]);
+                        if (from < 0) continue;
                     }
-                    for (int m = 0; m < 4; ++m)
-                        kept[m][l] = from < 0 ? T(0) : kept_last[4L * from + m];
+                    for (int m = 0; m < 4; ++m) kept[m][l] = kept_last[4L * from + m];
                 }
                 auto of = [](const T* from) -> V {
                     V v;
@@ -257,26 +271,42 @@ _LAW = """
         }
         const V3 whole = drag - n * size;
         const V3 moment = n.cross(whole);
-        for (int l = 0; l < count; ++l) {
-            if (!acts[l]) continue;
+        V on_i[W] = {
+            whole.x, whole.y, whole.z, moment.x * arm_i, moment.y * arm_i, moment.z * arm_i};
+        V on_j[W] = {
+            -whole.x, -whole.y, -whole.z, moment.x * arm_j, moment.y * arm_j, moment.z * arm_j};
+        on_i[6] = on_i[7] = on_j[6] = on_j[7] = V(T(0));
+        TURN_I
+        TURN_J
+        for (unsigned left = mine; left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            auto add = [&](int node, V values) {
+                U* to = (U*)(load + (long)LINE * node);
+                *to += values;
+            };
+            const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
+            add(node_i[l], on_i[l] * (T(1) - s_l));
+            add(node_i[l] + 1, on_i[l] * s_l);
+            add(node_j[l], on_j[l] * (T(1) - t_l));
+            add(node_j[l] + 1, on_j[l] * t_l);
             const long k = ks[l];
             pair_acts[k] = 1;
-            T* f = (T*)pair_force + 3 * k;
-            T* m = (T*)pair_moment + 3 * k;
-            T* arms = (T*)pair_arms + 4 * k;
-            f[0] = whole.x[l];
-            f[1] = whole.y[l];
-            f[2] = whole.z[l];
-            m[0] = moment.x[l];
-            m[1] = moment.y[l];
-            m[2] = moment.z[l];
-            arms[0] = s[l];
-            arms[1] = t[l];
-            arms[2] = arm_i[l];
-            arms[3] = arm_j[l];
             if constexpr (HAS_FRICTION) {
                 for (int p = 0; p < 4; ++p) kept_now[4 * k + p] = h_out[p][l];
                 written_now[k] = now;
+            }
+            if (keeps) {
+                T* f = (T*)pair_force + 3 * k;
+                T* m = (T*)pair_moment + 3 * k;
+                T* arms = (T*)pair_arms + 4 * k;
+                for (int c = 0; c < 3; ++c) {
+                    f[c] = ((const T*)(&whole.x + c))[l];
+                    m[c] = ((const T*)(&moment.x + c))[l];
+                }
+                arms[0] = s_l;
+                arms[1] = t_l;
+                arms[2] = ((const T*)&arm_i)[l];
+                arms[3] = ((const T*)&arm_j)[l];
             }
         }
     };
@@ -284,8 +314,8 @@ _LAW = """
 
 _SWEEP = """
     const int total = status[SLOT_COUNT];
-    const int begin = (int)((long)total * chunk / chunks);
-    const int end = (int)((long)total * (chunk + 1) / chunks);
+    const int begin = (int)((long)total * part / PARTS);
+    const int end = (int)((long)total * (part + 1) / PARTS);
     if (begin == end) return;
     constexpr int ROOM = 2 * W;
     int hit_k[ROOM], hits = 0;
@@ -344,9 +374,12 @@ _SWEEP = """
 
 def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
+    law = _LAW.replace("NORMAL", NORMAL)
+    for key, rows in (("TURN_I", "on_i"), ("TURN_J", "on_j")):
+        law = law.replace(key, transpose(LANES, rows))
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
-    const int kept_size = pair_step.shape[1];
+    const int kept_size = pair_step.shape[1], node_count = place.shape[0];
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
@@ -354,10 +387,11 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     {contact_constants(name)}
     if (status[SLOT_HALT] != 0) return;
     const V3 nothing3 = same3(0, 0, 0);
+    T* const load = contact_load + (long)LINE * node_count * part;
     {_ROWS}
     {POWERS}
-    {_HAND_OVER if features.friction else ""}
-    {_LAW.replace("NORMAL", NORMAL)}
+    {_HAND_OVER}
+    {law}
     {_SWEEP}
     }};
     sweep();
