@@ -13,9 +13,9 @@ from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
-from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
+from warpfiber.passes.native_bonds_source import BEGIN, END, LOADS
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
-from warpfiber.passes.native_capsules_source import LINE, PARTS
+from warpfiber.passes.native_capsules_source import LANES, LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
 
 REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
@@ -157,7 +157,7 @@ class NativeBonds:
         self.block_fiber = wp.array(fibers.ravel(), dtype=wp.int32, device=device)
         self.block_own = wp.array(own, dtype=wp.int32, device=device)
         nodes = model.node_count if any(features.walls) else 0
-        self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)
+        self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)  # in the step before
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
         size = PARTS * model.node_count * LINE
@@ -262,6 +262,7 @@ class NativeBonds:
         meter = [*spheres.press.meter(), *spheres.grips.meter()]
         drift = self.launch(BEGIN)
         drift.name = "drift"
+        self.touches.fill_(1)  # walls may have memories of a saved run
         begin = [clock, *motion, drift]
         middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
         end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END), *meter]

@@ -19,20 +19,21 @@ import warp as wp
 
 from warpfiber.model import EXPIRED, HALT, TORN
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, StepTimes
+from warpfiber.passes.kernel_module import kernel_module
 
 Items = Sequence[Launch | Call | Repeat]
 
 
 @cache
-def make_gates() -> tuple[Any, Any]:
+def make_gates(module: str = "unique") -> tuple[Any, Any]:
     """Kernels `shut_gate` and `open_gate` (one thread)."""
 
-    @wp.kernel(module="warpfiber_gates", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def shut_gate(status: wp.array(dtype=wp.int32)):
         if status[wp.static(EXPIRED)] + status[wp.static(TORN)] != 0:
             status[wp.static(HALT)] = 1
 
-    @wp.kernel(module="warpfiber_gates", enable_backward=False, grid_stride=False)
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def open_gate(status: wp.array(dtype=wp.int32)):
         if status[wp.static(TORN)] == 0:
             status[wp.static(HALT)] = 0
@@ -46,7 +47,8 @@ class JoinedSteps(Executor):
     def __init__(
         self, begin: Items, middle: Items, end: Items, device: str, workers: int, status: Any
     ) -> None:
-        shut, opened = (Launch("gate", kernel, 1, [status]) for kernel in make_gates())
+        gates = make_gates(kernel_module("gates"))
+        shut, opened = (Launch("gate", kernel, 1, [status]) for kernel in gates)
         super().__init__([*middle, shut], device, workers)
         self.status = status
         self.begin = Executor([*begin, shut], device, workers, single=True)

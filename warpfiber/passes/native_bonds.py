@@ -22,7 +22,7 @@ from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import BondFeatures
 from warpfiber.passes.native_bonds_source import END, LANES, LOADS, bond_sweep_source
-from warpfiber.passes.node_walls import SIDES, make_node_walls
+from warpfiber.passes.node_walls import make_node_walls
 
 LEAST_NODES, MOST_NODES = LANES, 256
 # A block costs about as much as this many fibers of the plain sweep.
@@ -56,7 +56,6 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
     Node = node_struct(name)
     wall_loads = make_node_walls(name, features.walls, features.wall_friction, features.press)
     has_walls, is_metered = any(features.walls), features.press >= 0
-    has_friction = features.wall_friction
     wall_x, wall_y, wall_z = features.walls
     zero = real(0.0)
 
@@ -94,14 +93,8 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
     ): ...
 
     @wp.func
-    def is_at_wall(
-        g: BondGroup,
-        i: wp.int32,
-        x: wp.vec3d,
-        wall_place: wp.array(dtype=wp.vec3d),
-        wall_depth: wp.array(dtype=real),
-    ) -> wp.bool:
-        """Whether a node touches a wall or has just ceased to."""
+    def is_at_wall(g: BondGroup, x: wp.vec3d, wall_place: wp.array(dtype=wp.vec3d)) -> wp.bool:
+        """Whether a node touches a wall."""
         reach = wp.float64(g.radius)
         for axis in range(3):
             has_wall = wp.static(wall_x)
@@ -112,10 +105,6 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             if has_wall:
                 if x[axis] - wall_place[0][axis] < reach or wall_place[1][axis] - x[axis] < reach:
                     return True
-                if wp.static(has_friction):
-                    slot = wp.static(SIDES) * i + 2 * axis
-                    if wall_depth[slot] != zero or wall_depth[slot + 1] != zero:
-                        return True
         return False
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -172,10 +161,11 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     last = fiber_node_start[fiber + 1] - 1
                     pushed = wp.vec2d()
                     for i in range(first, last + 1):
-                        touches = is_at_wall(g, i, place[i], wall_place, wall_depth)
-                        node_touches[i] = wp.uint8(touches)
-                        if not touches:
+                        touches = is_at_wall(g, place[i], wall_place)
+                        # a node that has just left a wall has a memory to be cleared
+                        if not touches and node_touches[i] == wp.uint8(0):
                             continue
+                        node_touches[i] = wp.uint8(touches)
                         node = Node()
                         node.x = place[i]
                         node.v = node_velocity[i]
