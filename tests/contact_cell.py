@@ -19,6 +19,7 @@ from warpfiber.passes.unilateral import ContactDual, ContactLaw
 from warpfiber.simulation import Simulation
 
 WALL = -1
+RELAXES: bool | None = None  # which solver; None: as the device has it
 
 
 class FlatRow(NamedTuple):
@@ -141,6 +142,7 @@ def solve_rows(
         most=most,
         fiber_frozen=fiber_frozen,
         chunks=chunks,
+        relaxes=RELAXES,
     )
     executor = Executor(dual.launches(), model.device, workers)
     executor.run(repeats, lambda: False)

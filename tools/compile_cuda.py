@@ -31,6 +31,7 @@ import warp as wp
 from warpfiber.laws.contact_compliance import LAWS
 from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import make_measure_bonds
+from warpfiber.passes.bond_losses import make_bond_losses
 from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
 from warpfiber.passes.capsule_pairs import CapsuleFeatures, make_capsule_pairs
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
@@ -39,6 +40,7 @@ from warpfiber.passes.chain_response import make_chain_apply, make_chain_respons
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
+from warpfiber.passes.contact_energy import make_contact_energy
 from warpfiber.passes.contact_memory import make_carry_memory
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
@@ -248,7 +250,11 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "steer_wall", "", make_wall_servo()
     yield "sum_grips", "", make_grip_sum(precision)
     yield "meter_grips", "", make_grip_meter()
-    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True))
+    yield "measure_bonds", "", make_measure_bonds(precision, (False, False, True), True)
+    for variant, bonds, _ in _bond_variants():
+        yield "bond_losses", variant, make_bond_losses(precision, bonds)
+    for is_step in (True, False):
+        yield "contact_energy", str(is_step), make_contact_energy(precision, rubbing, is_step)
     yield "largest_error", "", make_largest_error(precision)
     yield "take_back", "", make_take_back(precision)
     yield from _dual_kernels(precision)

@@ -143,7 +143,7 @@ def heap(skin: float | None = None, workers: int = 1, precision: str = "float64"
         stage=[{"kind": "settle", "damping": 60.0, "end_time": 1.0}],
         numerics=numerics,
         workers=workers,
-        quantities=["contacts"],
+        quantities=["contacts", "energy"],
     )
 
 

@@ -114,6 +114,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *("rod_maps rod_step".split()),
         *("bond_sweep bond_drift carry_memory capsule_pairs measure_bonds".split()),
         *("move_walls sum_pushes meter_walls steer_wall sum_grips meter_grips".split()),
+        *("bond_losses contact_energy measure_layers drag_moments contact_moments".split()),
         *listed,
         *contact,
     }

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from warpfiber.methods.stability import stable_limit
+from warpfiber.methods.stability import stable_limit, step_limits
+from warpfiber.scene import Scene, scene_from_dict
 
 BISECTION = 1e-6  # relative width at which `stable_limit` stops
 
@@ -62,3 +63,44 @@ def test_long_chain_has_the_limit_of_its_highest_mode() -> None:
     mass[0] = m
     exact = 1.0 / (math.sqrt(k / m) * math.cos(math.pi / (2.0 * nodes)))
     assert stable_limit(bands, still, mass, still) == pytest.approx(exact, rel=2.0 * BISECTION)
+
+
+def crossed_scene(**contact: float) -> Scene:
+    """Fibers of bonded spheres that may meet."""
+    return scene_from_dict(
+        {
+            "fibers": [
+                {
+                    "count": 2,
+                    "centerline_length": 0.024,
+                    "diameter": 2.4e-3,
+                    "density": 1340.0,
+                    "youngs_modulus": 7.5e5,
+                    "position": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.01]],
+                }
+            ],
+            "contact": contact,
+            "stage": [{"kind": "settle", "end_time": 1.0}],
+            "numerics": {"method": "bonded_spheres", "segments": 10, "device": "cpu"},
+        }
+    )
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_contacts_of_an_inner_node(friction: float) -> None:
+    """2 / omega of a node that two crossed fibers hold at 0.1 radii, moving against it.
+
+    Sliding and rolling together the node has 1 / m + a^2 / J = 3.5 / m, the stiffness two thirds.
+    """
+    scene = crossed_scene(friction=friction, modulus=7.5e7)
+    limits = {limit.term: limit.dt for limit in step_limits(scene)}
+    a = 1.2e-3
+    mass = 1340.0 * math.pi * a * a * 2.4e-3
+    modulus = 0.5 * 7.5e7 / 0.75
+    stiffness = 2.0 * 2.0 * (2.0 * modulus * math.sqrt(a * 0.1 * a))
+    parts = 3.5 * 2.0 / 3.0 if friction else 1.0
+    exact = 2.0 * math.sqrt(mass / (parts * stiffness))
+    assert limits["contacts"] == pytest.approx(exact, rel=1e-6)
+    assert step_limits(scene)[0].term == "contacts"
+    damped = crossed_scene(friction=friction, modulus=7.5e7, damping=0.3)
+    assert step_limits(damped)[0].dt < 0.8 * exact

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests import contact_cell
 from tests.cell import Kind, isotropic, straight_fiber
 from tests.contact_cell import FlatRow, Solved, row_arrays, solve_rows
 from tests.reference import contact_rows as cr
@@ -30,6 +31,13 @@ Start = Callable[..., Simulation]
 H = 0.05
 FAULT = 1e-9
 SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
+
+
+@pytest.fixture(params=["relaxed", "gradients"], autouse=True)
+def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both solvers: row after row, and passes over all rows."""
+    monkeypatch.setattr(contact_cell, "RELAXES", request.param == "relaxed")
+    return str(request.param)
 
 
 class Rods:
@@ -128,6 +136,7 @@ def test_hard_rows(start: Start, lubricated: bool) -> None:
         assert (got.force < 0.0).sum() > 5
 
 
+@pytest.mark.parametrize("solver", ["gradients"], indirect=True)
 def test_updates_are_those_of_the_restatement(start: Start) -> None:
     """The first updates agree to rounding, which the step sizes amplify later on."""
     rods = Rods(start)
@@ -224,6 +233,7 @@ def test_warm_start_of_the_solution(start: Start) -> None:
     assert (warm.shift == cold.shift).all()
 
 
+@pytest.mark.parametrize("solver", ["gradients"], indirect=True)
 def test_best_iterate_is_kept(start: Start) -> None:
     """Stopped early, forces and shifts are of the update with the smallest fault."""
     rods = Rods(start)
@@ -256,6 +266,7 @@ def test_frozen_rods_do_not_move(start: Start) -> None:
     assert (stuck.updates, stuck.fault) == (0, 0.0)
 
 
+@pytest.mark.parametrize("solver", ["gradients"], indirect=True)
 def test_sums_that_are_folded(start: Start) -> None:
     """Many chunks, as on CUDA, change nothing but the rounding of the sums."""
     rods = Rods(start)
@@ -266,6 +277,7 @@ def test_sums_that_are_folded(start: Start) -> None:
     assert rods.solve(chunks=(500, 7)).fault < FAULT
 
 
+@pytest.mark.parametrize("solver", ["gradients"], indirect=True)
 def test_launches_timed_apart(start: Start) -> None:
     """Replaying launch by launch repeats as often, and names every launch."""
     rods = Rods(start)
@@ -287,7 +299,7 @@ def test_same_for_any_number_of_workers(start: Start, precision: str) -> None:
         rods = Rods(start, precision=precision)
         rods.lubricate(5)
         found.append(rods.solve(workers=workers, tolerance=1e-3, most=200))
-    assert 3 < found[0].updates < 200
+    assert 1 < found[0].updates < 200
     for other in found[1:]:
         assert other.updates == found[0].updates
         assert (other.force == found[0].force).all()

@@ -28,12 +28,13 @@ SLENDER, POWER = 0.0684, 1.531  # exponents of F_2
 
 @cache
 def make_capsule_contact(name):
-    """`curvatures`, `hertz_factor`, `side_by_side`, `line_overlap` and `line_depth`."""
+    """`curvatures`, `hertz_factor`, `side_by_side`, `line_overlap`, `line_depth`, `line_square`."""
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     tiny, far_away = real(1.0e-30), real(1.0e30)
-    third, quarter = real(1.0 / 3.0), real(0.25)
+    third, quarter, ninth = real(1.0 / 3.0), real(0.25), real(1.0 / 9.0)
+    outermost = real(math.sqrt(0.6))  # of three Gauss points
     slender, power = real(SLENDER), real(POWER)
 
     @wp.func
@@ -79,25 +80,19 @@ def make_capsule_contact(name):
         return vec4(low / la, high / la, -start / lb, (la - start) / lb)
 
     @wp.func
-    def line_overlap(d0: vec3, d1: vec3, reach: real, low: real, high: real) -> vec4:
-        """(integral of the overlap, its center, its length, deepest overlap of endless lines).
-
-        D(u) = d0 + u (d1 - d0), low <= u <= high; all but the last in parts of a; 0 where nothing
-        overlaps.
-        """
+    def parabola(d0: vec3, d1: vec3, reach: real) -> vec4:
+        """(q, b, c, d_0) of the overlap q - b u - c u^2 along D(u) = d0 + u (d1 - d0)."""
         dv = d1 - d0
         vv = wp.dot(dv, dv)
         dd = wp.dot(d0, dv)
         square = wp.length_sq(d0)
         closest = wp.sqrt(wp.max(square - dd * dd / wp.max(vv, tiny), zero))
-        depth = reach - closest
-        if depth <= zero:
-            return vec4(zero, zero, zero, depth)
-        # overlap q - b u - c u^2, and its roots without the difference of large numbers
         scale = one / (reach + closest)
-        q = scale * (reach * reach - square)
-        b = scale * two * dd
-        c = scale * vv
+        return vec4(scale * (reach * reach - square), scale * two * dd, scale * vv, closest)
+
+    @wp.func
+    def positive_range(q: real, b: real, c: real, low: real, high: real) -> vec2:
+        """Where q - b u - c u^2 > 0 in low <= u <= high; its roots without large differences."""
         root = wp.sqrt(wp.max(b * b + real(4.0) * c * q, zero))
         if b < zero:
             root = -root
@@ -110,8 +105,41 @@ def make_capsule_contact(name):
             beyond = -far_away
         if wp.abs(t) < real(1.0e20) * c:
             beyond = t / c
-        u0 = wp.max(low, wp.min(near, beyond))
-        u1 = wp.min(high, wp.max(near, beyond))
+        return vec2(wp.max(low, wp.min(near, beyond)), wp.min(high, wp.max(near, beyond)))
+
+    @wp.func
+    def line_square(d0: vec3, d1: vec3, reach: real, low: real, high: real) -> real:
+        """Integral of the squared overlap, as `line_overlap`: three Gauss points are exact."""
+        form = parabola(d0, d1, reach)
+        found = positive_range(form[0], form[1], form[2], low, high)
+        if reach <= form[3] or found[1] <= found[0]:
+            return zero
+        middle = half * (found[0] + found[1])
+        reached = half * (found[1] - found[0])
+        total = zero
+        for k in range(3):
+            u = middle + real(k - 1) * outermost * reached
+            overlap = form[0] - (form[1] + form[2] * u) * u
+            total += wp.where(k == 1, real(8.0), real(5.0)) * overlap * overlap
+        return ninth * reached * total
+
+    @wp.func
+    def line_overlap(d0: vec3, d1: vec3, reach: real, low: real, high: real) -> vec4:
+        """(integral of the overlap, its center, its length, deepest overlap of endless lines).
+
+        D(u) = d0 + u (d1 - d0), low <= u <= high; all but the last in parts of a; 0 where nothing
+        overlaps.
+        """
+        form = parabola(d0, d1, reach)
+        depth = reach - form[3]
+        if depth <= zero:
+            return vec4(zero, zero, zero, depth)
+        q = form[0]
+        b = form[1]
+        c = form[2]
+        found = positive_range(q, b, c, low, high)
+        u0 = found[0]
+        u1 = found[1]
         if u1 <= u0:
             return vec4(zero, zero, zero, depth)
         w1 = u1 - u0
@@ -133,4 +161,4 @@ def make_capsule_contact(name):
         u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), -one, two)
         return reach - wp.length(d0 + u * dv)
 
-    return curvatures, hertz_factor, side_by_side, line_overlap, line_depth
+    return curvatures, hertz_factor, side_by_side, line_overlap, line_depth, line_square

@@ -2,9 +2,10 @@
 
 Source: with M, K, C of small motions and forces that take the speed of the middle of the step, the
     step turns unstable through the eigenvalue -1: where 4 M - 2 dt C - dt^2 K is no longer
-    positive, that is at the largest l = 1 / dt of (4 l^2 M - 2 l C - K) x = 0.
-Limits: bent fibers and several contacts on one node lower the true limit; `dt_fraction` covers
-    them.
+    positive, that is at the largest l = 1 / dt of (4 l^2 M - 2 l C - K) x = 0. Contacts: Hertz of
+    crossed cylinders and its tangential stiffness at an estimated overlap, nodes against nodes.
+Limits: the terms are taken one by one; bent fibers, larger overlaps and more contacts on one node
+    lower the true limit; `dt_fraction` covers them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from warpfiber.methods.bond_constants import bond_constants
 from warpfiber.scene import FiberGroup, Scene
 
 Matrix = np.ndarray
-WALL_OVERLAP = 0.1  # radii, where the stiffness of a wall is taken
+OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
+CROWD = 2  # contacts with other fibers that an inner node of a dense bed has; an end has one
 LONGEST_CHAIN = 16  # segments; longer fibers have the same limits
 
 
@@ -62,9 +64,37 @@ def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
         ),
         "bond twist": limit(turning, (3, arm, first)),
     }
+    contact = scene.contact
+    end, inner = (c.end_mass, c.end_inertia), (c.mass, c.inertia)
     if scene.box is not None and "wall" in scene.box.boundary:
-        stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(WALL_OVERLAP)
-        resistance = DASHPOT * scene.contact.damping * math.sqrt(stiffness * c.end_mass)
-        end = np.array([c.end_mass])
-        steps["walls"] = stable_step(end, np.array([[resistance]]), np.array([[stiffness]]))
+        stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)
+        steps["walls"] = touch_step(scene, group, end, stiffness, contact.wall_friction)
+    if contact.law != "none":
+        # against a fiber of its own kind half the modulus; what it touches moves against it
+        stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)
+        touched = [touch_step(scene, group, end, stiffness, contact.friction)]
+        if n > 1:
+            touched.append(touch_step(scene, group, inner, CROWD * stiffness, contact.friction))
+        steps["contacts"] = min(touched)
     return steps
+
+
+def touch_step(
+    scene: Scene,
+    group: FiberGroup,
+    node: tuple[float, float],
+    stiffness: float,
+    friction: float,
+) -> float:
+    """Of a node (mass, moment of inertia) that is held with this normal stiffness.
+
+    With friction also its rolling under the tangential stiffness: slip = v + a w.
+    """
+    c = bond_constants(scene, group)
+    moved = np.array([node[0], node[1] / group.radius**2])
+    ratio = 4.0 * c.compliance / c.shear_compliance
+    steps = []
+    for held, k in ((np.diag([1.0, 0.0]), stiffness), (np.ones((2, 2)), ratio * stiffness)):
+        resistance = DASHPOT * scene.contact.damping * math.sqrt(k * node[0])
+        steps.append(stable_step(moved, resistance * held, k * held))
+    return min(steps) if friction > 0.0 else steps[0]

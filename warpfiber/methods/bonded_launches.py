@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from warpfiber.passes.bond_drift import make_bond_drift
@@ -13,9 +14,9 @@ from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
-from warpfiber.passes.native_bonds_source import BEGIN, END, LOADS
+from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
-from warpfiber.passes.native_capsules_source import LANES, LINE, PARTS
+from warpfiber.passes.native_capsules_source import LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
 
 REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
@@ -160,8 +161,17 @@ class NativeBonds:
         self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)  # in the step before
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
+        first, last = self._tips()
+        tips = (first + 2 * last).astype(np.uint8)
+        self.segment_tips = wp.array(tips, dtype=wp.uint8, device=device)
         size = PARTS * model.node_count * LINE
         self.contact_load = wp.zeros(size, dtype=p.real, device=device)
+
+    def _tips(self) -> tuple[np.ndarray, np.ndarray]:
+        """(S,) whether a segment is the first one of its fiber, and the last one."""
+        fiber = self.spheres.model.host["segment_fiber"]
+        other = np.diff(fiber) != 0
+        return np.concatenate([[True], other]), np.concatenate([other, [True]])
 
     def launch(self, phase: int) -> Launch:
         """What `phase` says: sums of LOADS, END and BEGIN."""
@@ -222,7 +232,7 @@ class NativeBonds:
             p.real(spheres.scene.contact.friction),
             p.real(REACH_MARGIN * pairs.reach),
             spheres.groups,
-            model.fiber_node_start,
+            self.segment_tips,
             model.fiber_group,
             model.segment_node,
             model.segment_fiber,
@@ -251,20 +261,25 @@ class NativeBonds:
         """What a step launches."""
         launches = [clock_launch(self.spheres), self.pair_launch(0.0)]
         launches += [self.launch(0), *self.spheres.press.motion(), *self.spheres.press.meter()]
-        launches += self.spheres.grips.meter()
+        launches += [*self.spheres.grips.meter(), *self.spheres.energies.losses()]
         return [launch.kernel for launch in launches]
 
     def steps(self) -> JoinedSteps:
-        """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick."""
+        """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick.
+
+        What a step dissipates is found at its end, which is then a launch of its own.
+        """
         spheres = self.spheres
         clock, dt = clock_launch(spheres), spheres.dt
         motion = spheres.press.motion()
-        meter = [*spheres.press.meter(), *spheres.grips.meter()]
+        meter = [*spheres.press.meter(), *spheres.grips.meter(), *spheres.energies.losses()]
         drift = self.launch(BEGIN)
         drift.name = "drift"
         self.touches.fill_(1)  # walls may have memories of a saved run
         begin = [clock, *motion, drift]
         middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
         end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END), *meter]
+        if spheres.energies.told:
+            middle = [*end, *begin]
         device, status = spheres.model.device, spheres.state.status
         return JoinedSteps(begin, middle, end, device, spheres.workers, status)

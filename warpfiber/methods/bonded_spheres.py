@@ -28,11 +28,11 @@ from warpfiber.methods.bonded_launches import (
     drift_launch,
     pair_launch,
 )
+from warpfiber.methods.energies import Energies
 from warpfiber.methods.grips import Grips
 from warpfiber.methods.method import Method
 from warpfiber.methods.press import Press
 from warpfiber.model import EXPIRED, TORN, Model, State
-from warpfiber.passes.bond_energy import ENERGIES, make_measure_bonds, measure_bond_energies
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
@@ -110,6 +110,7 @@ class BondedSpheres(Method):
         self.native: NativeBonds | None = None
         if NATIVE and native_bonds_apply(model, self.features):
             self.native = NativeBonds(self)
+        self.energies = Energies(self)
 
     # -- building ---------------------------------------------------------------------------------
 
@@ -155,7 +156,7 @@ class BondedSpheres(Method):
     def launches(self) -> list[Launch | Call | Repeat]:
         """Clock and bonds; drift and pairs before the bonds where fibers meet."""
         begin = [clock_launch(self), *self.press.motion()]
-        end = [*self.press.meter(), *self.grips.meter()]
+        end = [*self.press.meter(), *self.grips.meter(), *self.energies.losses()]
         if self.contacts is None:
             return [*begin, bond_launch(self, drifts=True, kicks=True), *end]
         return [
@@ -174,8 +175,8 @@ class BondedSpheres(Method):
     def prepare(self, measuring: Iterable[Any] = ()) -> None:
         """Compile and capture; find the accelerations of the start."""
         kernels = list(measuring)
-        if self.executor is None and "energy" in self.scene.record.quantities:
-            kernels.append(make_measure_bonds(self.model.precision.name, self.features.walls))
+        if self.executor is None:
+            kernels += self.energies.kernels()
         if self.contacts is not None:
             kernels += self.contacts.kernels()
         self._prepare_steps(kernels)
@@ -291,38 +292,12 @@ class BondedSpheres(Method):
 
     def measure(self) -> dict[str, float]:
         """Energies in J and what walls feel, where `record.quantities` asks for them."""
-        pressed = self.press.measure() | self.grips.measure()
-        if "energy" not in self.scene.record.quantities:
-            return pressed
-        model, walls = self.model, self.features.walls
-        inputs = [
-            wp.vec3d(*self.press.corners.mean(axis=0)),
-            self.press.place,
-            self.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            self.bond_axis,
-            self.bond_length,
-            self.place,
-            self.state.node_velocity,
-            self.node_turn,
-            self.node_spin,
-        ]
-        found = measure_bond_energies(
-            model.precision.name, walls, model.fiber_count, inputs, model.device
-        )
-        absent = {"gravity"} if self.scene.gravity is None else set()
-        absent |= set() if any(walls) else {"wall"}
-        return pressed | {
-            f"energy_{name}": found[name] * model.units.energy
-            for name in ENERGIES
-            if name not in absent
-        }
+        return self.press.measure() | self.grips.measure() | self.energies.measure()
 
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
-        arrays |= self.press.saved() | self.grips.saved()
+        arrays |= self.press.saved() | self.grips.saved() | self.energies.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -331,6 +306,7 @@ class BondedSpheres(Method):
             getattr(self, name).assign(arrays[f"bonds_{name}"])
         self.press.restore(arrays)
         self.grips.restore(arrays)
+        self.energies.restore(arrays)
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)

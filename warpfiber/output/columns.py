@@ -52,6 +52,7 @@ _PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"a[123]{4}", "", f"fourth-order orientation tensor, {BY_LENGTH}"),
     (r"a[123]{4}_fiber", "", f"fourth-order orientation tensor, {BY_NUMBER}"),
     (r"energy_\w+", "J", "energy of this kind, all fibers"),
+    (r"dissipated_\w+", "J", "energy lost in this way since the start"),
     (r"stress_[123]{2}", "Pa", "what the fibers add to the stress of the box, tension positive"),
     (
         r"stress_contact_[123]{2}",

@@ -109,6 +109,7 @@ FIGURES = (
             "energy_twist": ("twist", INK),
             "energy_repulsion": ("repulsion", PURPLE),
             "energy_wall": ("walls", GRAY),
+            "energy_contact": ("contacts", PURPLE),
         },
         logarithmic=True,
     ),

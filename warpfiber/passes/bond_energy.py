@@ -14,25 +14,51 @@ from warpfiber.laws.bond import make_bond
 from warpfiber.laws.hertz import make_hertz
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.node_walls import SIDES
 
 # Columns; those of walls are zero without them.
-ENERGIES = ("kinetic", "stretching", "shear", "bending", "twist", "gravity", "wall")
+ENERGIES = (
+    "kinetic",
+    "stretching",
+    "shear",
+    "bending",
+    "twist",
+    "gravity",
+    "wall",
+    "wall friction",
+)
 
 
 @cache
-def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
+def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: bool = False):
     """Kernel `measure_bonds`: energies (F, len(ENERGIES)) of the present state."""
     p = precision(name)
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     _, bond_energies, _ = make_bond(name)
-    _, _, plane_energy = make_hertz(name)
+    plane_stiffness, _, plane_energy = make_hertz(name)
     wall_x, wall_y, wall_z = walls
     has_walls = any(walls)
+    half_real = real(0.5)
 
     @wp.func
-    def walls_energy(g: BondGroup, x: wp.vec3d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
-        energy = wp.float64(0.0)
+    def rubbed_energy(g: BondGroup, depth: real, h: vec3) -> wp.float64:
+        """Of the memory of a wall's friction; a stale one has no depth."""
+        k = real(4.0) * g.compliance / g.shear_compliance
+        k *= plane_stiffness(g.wall_modulus, g.radius, depth)
+        return wp.float64(half_real * k * wp.length_sq(h))
+
+    @wp.func
+    def walls_energy(
+        g: BondGroup,
+        x: wp.vec3d,
+        low: wp.vec3d,
+        high: wp.vec3d,
+        i: wp.int32,
+        wall_memory: wp.array(dtype=vec3),
+    ) -> wp.vec2d:
+        """Of the pushes of all walls on a node, and of their friction."""
+        energy = wp.vec2d()
         for axis in range(3):
             has_wall = wp.static(wall_x)
             if axis == 1:
@@ -42,14 +68,19 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
             if has_wall:
                 below = g.radius - real(x[axis] - low[axis])
                 above = g.radius - real(high[axis] - x[axis])
-                energy += wp.float64(plane_energy(g.wall_modulus, g.radius, below))
-                energy += wp.float64(plane_energy(g.wall_modulus, g.radius, above))
+                energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, below))
+                energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, above))
+                if wp.static(has_friction):
+                    slot = wp.static(SIDES) * i + 2 * axis
+                    energy[1] += rubbed_energy(g, below, wall_memory[slot])
+                    energy[1] += rubbed_energy(g, above, wall_memory[slot + 1])
         return energy
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def measure_bonds(
         middle: wp.vec3d,
         wall_place: wp.array(dtype=wp.vec3d),
+        wall_memory: wp.array(dtype=vec3),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -68,7 +99,7 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
         half = wp.float64(0.5)
         kinetic = wp.float64(0.0)
         gravity = wp.float64(0.0)
-        wall = wp.float64(0.0)
+        wall = wp.vec2d()
         bonds = wp.vec4d()
         for i in range(first, last + 1):
             mass = wp.float64(g.mass)
@@ -80,7 +111,7 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
             kinetic += half * (moving + inertia * wp.length_sq(wp.vec3d(node_spin[i])))
             gravity -= mass * wp.dot(wp.vec3d(g.weight), place[i] - middle)
             if wp.static(has_walls):
-                wall += walls_energy(g, place[i], wall_place[0], wall_place[1])
+                wall += walls_energy(g, place[i], wall_place[0], wall_place[1], i, wall_memory)
             j = i + 1
             if i == last:
                 j = first
@@ -95,16 +126,16 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool]):
         for part in range(4):
             energies_out[fiber, part + 1] = bonds[part]
         energies_out[fiber, 5] = gravity
-        energies_out[fiber, 6] = wall
+        energies_out[fiber, 6] = wall[0]
+        energies_out[fiber, 7] = wall[1]
 
     return measure_bonds
 
 
 def measure_bond_energies(
-    name: str, walls: tuple[bool, bool, bool], fibers: int, inputs: list[Any], device: str
+    kernel: Any, fibers: int, inputs: list[Any], device: str
 ) -> dict[str, float]:
     """Sums of all ENERGIES over the fibers, run units."""
     energies = wp.zeros((fibers, len(ENERGIES)), dtype=wp.float64, device=device)
-    kernel = make_measure_bonds(name, walls)
     wp.launch(kernel, dim=fibers, inputs=[*inputs, energies], device=device)
     return dict(zip(ENERGIES, np.sum(energies.numpy(), axis=0).tolist(), strict=True))

@@ -132,7 +132,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 reach = gi.radius + other.radius
                 if wp.length_sq(c) < reach * reach:
                     at = node_j - fiber_node_start[fiber_j]
-                    push, depth = normal_contact(
+                    push, depth, _energy = normal_contact(
                         gi, other, at_i, at, node_i, node_j, delta, a, b, st, node_pos
                     )
             if push[0] <= zero:

@@ -17,18 +17,20 @@ from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geomet
 
 
 @cache
-def make_capsule_touch(name: str, periodic: bool):
-    """`normal_contact`: (force, stiffness, s, t) and the depth that its memory goes by."""
+def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False):
+    """`normal_contact`: (force, stiffness, s, t), depth for memories, energy if wanted."""
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=periodic)
     _, _, is_local_minimum, _ = make_pair_geometry(name, geometry)
-    curvatures, hertz_factor, side_by_side, line_overlap, line_depth = make_contact(name)
+    curvatures, hertz_factor, side_by_side, line_overlap, line_depth, line_square = make_contact(
+        name
+    )
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     near = real(END_TOLERANCE[name])
     line_cosine, line_part, least_sine = real(LINE_COSINE), real(LINE_PART), real(SMALLEST_SINE)
-    two_thirds = real(2.0 / 3.0)
+    two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
 
     @wp.func
     def effective_modulus(gi: BondGroup, gj: BondGroup) -> real:
@@ -48,7 +50,7 @@ def make_capsule_touch(name: str, periodic: bool):
         st: vec2,
         node_pos: wp.array(dtype=vec3),
     ):
-        """(force, stiffness, s, t) and depth; no force where another pair of segments has it."""
+        """No force where another pair of segments has the contact."""
         reach = gi.radius + gj.radius
         modulus = effective_modulus(gi, gj)
         c = delta + st[1] * b - st[0] * a
@@ -61,6 +63,7 @@ def make_capsule_touch(name: str, periodic: bool):
 
         line = vec4(zero, zero, zero, zero)
         deepest = zero
+        line_energy = zero
         is_line = wp.bool(False)
         if cosine > line_cosine:
             beside = side_by_side(delta, a, b)
@@ -78,6 +81,9 @@ def make_capsule_touch(name: str, periodic: bool):
                 t = wp.clamp(beside[2] + over[1] * (beside[3] - beside[2]), zero, one)
                 line = vec4(stiffness * over[0], stiffness * over[2], over[1], t)
                 deepest = line_depth(d0, d1, reach)
+                if wp.static(has_energy):
+                    square = line_square(d0, d1, reach, beside[0], beside[1])
+                    line_energy = half * stiffness * square
 
         ends = wp.int32(0)
         if (st[0] <= near and at_i == 0) or (st[0] >= one - near and at_i == gi.segments - 1):
@@ -85,11 +91,11 @@ def make_capsule_touch(name: str, periodic: bool):
         if (st[1] <= near and at_j == 0) or (st[1] >= one - near and at_j == gj.segments - 1):
             ends += 2
         if is_line and ends == 0:
-            return line, deepest
+            return line, deepest, line_energy
         if not is_local_minimum(
             st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
         ):
-            return line, deepest
+            return line, deepest, line_energy
         depth = wp.max(reach - wp.length(c), zero)
         factor = hertz_factor(curvatures(ends, ki, kj, sine))
         patch = wp.sqrt(two * reach * depth) / sine
@@ -99,8 +105,8 @@ def make_capsule_touch(name: str, periodic: bool):
         stiffness = two * modulus * factor * wp.sqrt(depth)
         force = two_thirds * stiffness * depth
         if line[0] >= force:
-            return line, deepest
-        return vec4(force, stiffness, st[0], st[1]), depth
+            return line, deepest, line_energy
+        return vec4(force, stiffness, st[0], st[1]), depth, two_fifths * force * depth
 
     @wp.func
     def is_hollow(vertex: vec3, from_other: vec3, other: vec3, onward: vec3) -> wp.bool:

@@ -1,7 +1,7 @@
 """How far the ends of contact rows move on a flexible fiber: blocks of J S J^T, fiber by fiber.
 
 A row has an end on each of its fibers. The block of a fiber, ends by ends, is filled column by
-column (on the CPU at once, `native_blocks`) when a row first has a force, so that an update costs
+column when a row first has a force, so that an update costs
 no solve; a fiber whose block does not fit `block` is solved in every update.
 Symbols: ends of a fiber in the order of the rows that it owns, then those that it is the partner
     of; motion of an end along its row, -n for the owner and n for the partner.
@@ -12,21 +12,19 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import HALT, precision
-from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push, make_reply_numbers
+from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import OPTIONS
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
 from warpfiber.passes.elimination import elimination_row
-from warpfiber.passes.native_blocks import MOST_NODES, make_native_blocks
 from warpfiber.passes.precision import group_struct
 
 
 @cache
-def make_end_kernels(name: str, lanes: int = 1):
+def make_end_kernels(name: str):
     """Kernels `end_count` and `end_fill` (one thread per fiber), `end_scan` (one thread) between.
 
     Fiber f has the ends `end_start[f]` .. `end_start[f + 1]` and, unless that is -1, the block from
-    `block_start[f]` on, as many numbers per end as whole vectors of `lanes` take. Row r has the
-    ends `row_end[2 r]` and `row_end[2 r + 1]` (-1: a wall).
+    `block_start[f]` on. Row r has the ends `row_end[2 r]` and `row_end[2 r + 1]` (-1: a wall).
     """
     real = precision(name).real
 
@@ -69,10 +67,9 @@ def make_end_kernels(name: str, lanes: int = 1):
             total += ends
             end_start[fiber + 1] = total
             block_start[fiber] = -1
-            width = (ends + wp.static(lanes - 1)) / wp.static(lanes) * wp.static(lanes)
-            if wp.int64(ends) * wp.int64(width) <= wp.int64(block_size - used):
+            if wp.int64(ends) * wp.int64(ends) <= wp.int64(block_size - used):
                 block_start[fiber] = used
-                used += ends * width
+                used += ends * ends
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def end_fill(
@@ -117,18 +114,13 @@ def make_end_kernels(name: str, lanes: int = 1):
 
 
 @cache
-def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
-    """Kernel `chain_moves`, one thread per fiber: motion of its ends by the present forces.
-
-    `native`: whole blocks by `native_blocks`, for the CPU.
-    """
+def make_chain_moves(name: str, has_frozen: bool):
+    """Kernel `chain_moves`, one thread per fiber: motion of its ends by the present forces."""
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
     Row = elimination_row(name)
     chain_reply = make_chain_reply(name)
-    reply_numbers = make_reply_numbers(name)
-    fill_block, move_ends = make_native_blocks(name)
     gather_push = make_gather_push(name)
     zero, one = real(0.0), real(1.0)
 
@@ -197,9 +189,6 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
         base = row_stride * fiber
         dt = real(step_size[0])
         column = block_start[fiber]
-        if wp.static(native):
-            if segments >= wp.static(MOST_NODES):
-                column = wp.int32(-1)
         if column < 0:
             gather_push(
                 fiber,
@@ -235,36 +224,6 @@ def make_chain_moves(name: str, has_frozen: bool, native: bool = False):
                     end_move[e] = end_motion(row_node[r][0], row_s[r], -row_normal[r], node_shift)
                 else:
                     end_move[e] = end_motion(row_node[r][1], row_t[r], row_normal[r], node_shift)
-            return
-        if wp.static(native):
-            if end_known[begin] == wp.uint8(0):
-                end_known[begin] = wp.uint8(1)
-                n = reply_numbers(g, dt, segments)
-                fill_block(
-                    first,
-                    segments,
-                    base,
-                    begin,
-                    end,
-                    owned,
-                    column,
-                    n.h,
-                    n.kappa,
-                    n.drag_end,
-                    n.drag_inner,
-                    n.drag_off,
-                    n.strength,
-                    g.weight,
-                    g.weight_excess,
-                    rows,
-                    row_node,
-                    row_s,
-                    row_t,
-                    row_normal,
-                    end_row,
-                    block,
-                )
-            move_ends(begin, end, column, block, end_force, end_move)
             return
         for e in range(begin, end):
             end_move[e] = zero

@@ -10,11 +10,13 @@ import warp as wp
 
 from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
+from warpfiber.passes.chain_relaxation import REPLY_NUMBERS, make_chain_relaxation
 from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.native import LANES
+from warpfiber.passes.native_blocks import MOST_NODES
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
 
@@ -147,7 +149,6 @@ class ChainResponse:
 
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
     block_share: numbers per end in `block`, the ends that a fiber may have on average.
-    native: blocks by SIMD, for the CPU; equal to rounding.
     """
 
     by_ends = True
@@ -158,11 +159,12 @@ class ChainResponse:
         rows: Any,
         row_stride: int,
         tension: Any,
-        block_share: int = BLOCK_SHARE,
-        native: bool | None = None,
+        block_share: int | None = None,
     ) -> None:
-        self.native = model.device.startswith("cpu") if native is None else native
-        self.block_share = block_share
+        most = max(row["segments"] for row in model.group_rows)
+        self.relaxes = model.device.startswith("cpu") and most < MOST_NODES
+        share = BLOCK_SHARE + (4 * (most + 1) if self.relaxes else 0)
+        self.block_share = share if block_share is None else block_share
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
         self.node_push = self._array(nodes, p.vec3)
@@ -189,7 +191,7 @@ class ChainResponse:
         self._allocate(2 * rows.row_i.shape[0])
         fibers = model.fiber_count
         name = model.precision.name
-        kernels = make_end_kernels(name, LANES[name] if self.native else 1)
+        kernels = make_end_kernels(name)
         lists = [rows.row_out_start, dual.fiber_in, dual.row_next]
         counted = [model.fiber_node_start, rows.row_count, *lists, self.end_start]
         scanned = [fibers, self.block.shape[0], status, self.end_start, self.block_start]
@@ -251,7 +253,7 @@ class ChainResponse:
             self.end_force,
             self.end_move,
         ]
-        kernel = make_chain_moves(model.precision.name, dual.has_frozen, self.native)
+        kernel = make_chain_moves(model.precision.name, dual.has_frozen)
         return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
 
     def end(self, dual: ContactDual) -> list[Launch | Call]:
@@ -260,6 +262,59 @@ class ChainResponse:
         inputs = [*self._fibers(dual), *self._rows(dual), dual.state.status, *self._work(dual)]
         kernel = make_chain_response(model.precision.name, dual.has_frozen, dual.module)
         return [Launch("chain_response", kernel, model.fiber_count, inputs, split=True)]
+
+    def relax(self, dual: ContactDual) -> list[Launch | Call]:
+        """Forces, shift and tensions of the solution."""
+        model, rows, law, p = self.model, dual.rows, dual.law, self.model.precision
+        fibers, ends = model.fiber_count, 2 * rows.row_i.shape[0]
+        nodes = 1 + max(row["segments"] for row in model.group_rows)
+        # hardly touched: what the rows of a step do not need stays out of memory
+        self.block = wp.empty(self.block_share * ends, dtype=p.real, device=model.device)
+        work = [
+            self._array(REPLY_NUMBERS * len(model.group_rows), p.real),
+            self.end_start,
+            self.block_start,
+            self._array(fibers, wp.uint8),
+            self._array(ends, wp.int32),
+            self._array(ends, p.real),
+            self.block,
+            wp.empty(LANES[p.name] * (ends + LANES[p.name] + 4 * nodes), p.real, model.device),
+        ]
+        inputs = [
+            fibers,
+            self.row_stride,
+            dual.most,
+            wp.float64(dual.tolerance),
+            law.stiffness,
+            law.decay,
+            dual.step_size,
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            model.segment_node,
+            model.segment_fiber,
+            dual.fiber_frozen,
+            self.rows,
+            rows.row_count,
+            rows.row_out_start,
+            rows.row_i,
+            rows.row_j,
+            rows.row_s,
+            rows.row_t,
+            rows.row_normal,
+            rows.row_base,
+            rows.row_compliance,
+            *work,
+            *dual.relaxation_work(),
+            dual.state.status,
+            rows.row_force,
+            dual.node_shift,
+            self.segment_impulse,
+            dual.best,
+            dual.control,
+        ]
+        kernel = make_chain_relaxation(p.name, law.kind)
+        return [Launch("chain_relax", kernel, 1, inputs)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
         """Moves the fibers by the solution and adds its tensions."""

@@ -1,49 +1,48 @@
-"""The blocks of `chain_blocks` for the CPU: a SIMD vector of ends at a time.
+"""Motion of one flexible fiber by unit forces at its ends of rows, a SIMD vector of ends at a time.
 
-A lane is an end with a unit force; the two solves of `chain_reply` run on all lanes at once and
-fill as many columns of the block. A block is stored with whole vectors per end, so that an update
-is a few products of vectors.
+A lane is an end with a unit force; the two solves of `chain_reply` run on all lanes at once. They
+leave as many columns of the block of the fiber (how far every end moves along its row) and what the
+whole fiber does: displacements of the nodes and impulses of the segments before them.
 Symbols: as in `chain_reply`; T, W, V, U, V3 from `native.lane_types`; z displacements and b
     impulses of the nodes, `at` the node before the end, `share` the part of the force on the next.
-Limits: fibers of up to MOST_NODES nodes (stack); sums are in another order than in `chain_reply`
-    and multiplications and additions are fused: equal to rounding.
+Limits: CPU only; fibers of up to MOST_NODES nodes (stack); sums are in another order than in
+    `chain_reply` and multiplications and additions are fused: equal to rounding.
 """
-
-from functools import cache
-from typing import Any
-
-import warp as wp
-
-from warpfiber.model import precision
-from warpfiber.passes.elimination import elimination_row
-from warpfiber.passes.native import lane_types
 
 MOST_NODES = 512
 
+# `fill(f, group, column, width, reply)`: lanes are the ends group ... group + W - 1 of fiber f;
+# end e of it moves by column[e width + lane]. `row_of(f, x)` is the row of an end, its owner first.
 FILL_BLOCK = """
-    const int count = end - begin, width = (count + W - 1) / W * W;
-    T* const columns = block.data + column;
-    V3 z[MOST_NODES];
-    V b[MOST_NODES];
-    auto times = [&](const auto& row, const V3& v) -> V3 {
-        const auto& d = row.diagonal;
-        const auto& o = row.off;
-        return V3{d[0] * v.x + o[0] * v.y + o[1] * v.z, o[0] * v.x + d[1] * v.y + o[2] * v.z,
-                  o[1] * v.x + o[2] * v.y + d[2] * v.z};
-    };
-    auto along = [](const auto& u, const V3& v) -> V {
-        return u[0] * v.x + u[1] * v.y + u[2] * v.z;
-    };
-    auto same = [](const auto& u) -> V3 { return V3{V(u[0]), V(u[1]), V(u[2])}; };
-    const V3 none = same3(T(0), T(0), T(0));
-    for (int group = 0; group < count; group += W) {
+    auto fill = [&](int f, int group, T* column, int width, U* reply) {
+        const int first = fiber_node_start.data[f];
+        const int segments = fiber_node_start.data[f + 1] - first - 1;
+        const int base = row_stride * f, count = end_start.data[f + 1] - end_start.data[f];
+        const int owned = row_last(f) - row_first(f), of = fiber_group.data[f];
+        const T* const number = numbers.data + 6 * of;
+        const T h = number[0], kappa = number[1], drag_end = number[2], drag_inner = number[3];
+        const T drag_off = number[4], strength = number[5];
+        const T weight = groups.data[of].weight, weight_excess = groups.data[of].weight_excess;
+        V3 z[MOST_NODES];
+        V b[MOST_NODES];
+        auto times = [&](const auto& row, const V3& v) -> V3 {
+            const auto& d = row.diagonal;
+            const auto& o = row.off;
+            return V3{d[0] * v.x + o[0] * v.y + o[1] * v.z, o[0] * v.x + d[1] * v.y + o[2] * v.z,
+                      o[1] * v.x + o[2] * v.y + d[2] * v.z};
+        };
+        auto along = [](const auto& u, const V3& v) -> V {
+            return u[0] * v.x + u[1] * v.y + u[2] * v.z;
+        };
+        auto same = [](const auto& u) -> V3 { return V3{V(u[0]), V(u[1]), V(u[2])}; };
+        const V3 none = same3(T(0), T(0), T(0));
         V at = V(T(-9)), share = V(T(0));
         V3 push = none;
         for (int l = 0; l < W && group + l < count; ++l) {
-            const int r = end_row.data[begin + group + l];
+            const int r = row_of(f, group + l);
             const bool own = group + l < owned;
             const auto& n = row_normal.data[r];
-            at[l] = T(row_node.data[r][own ? 0 : 1] - first);
+            at[l] = T(end_node(r, own) - first);
             share[l] = own ? row_s.data[r] : row_t.data[r];
             push.x[l] = own ? -n[0] : n[0];
             push.y[l] = own ? -n[1] : n[1];
@@ -99,74 +98,22 @@ FILL_BLOCK = """
                 beyond = behind;
                 behind = x;
                 z[k] = x;
+                b[k] = whole;
             }
         }
         for (int e = 0; e < count; ++e) {
-            const int r = end_row.data[begin + e];
+            const int r = row_of(f, e);
             const bool own = e < owned;
             const T t = own ? row_s.data[r] : row_t.data[r];
-            const int k = row_node.data[r][own ? 0 : 1] - first;
+            const int k = end_node(r, own) - first;
             const V move = along(row_normal.data[r], z[k] * V(T(1) - t) + z[k + 1] * V(t));
-            *(U*)(columns + (long)e * width + group) = own ? -move : move;
+            *(U*)(column + (long long)e * width) = own ? -move : move;
         }
-    }
-"""
-
-MOVE_ENDS = """
-    const int count = end - begin, width = (count + W - 1) / W * W;
-    const T* const columns = block.data + column;
-    for (int group = 0; group < count; group += W) {
-        V move = V(T(0));
-        for (int e = 0; e < count; ++e)
-            move += end_force.data[begin + e] * *(const U*)(columns + (long)e * width + group);
-        for (int l = 0; l < W && group + l < count; ++l)
-            end_move.data[begin + group + l] = move[l];
-    }
-"""
-
-
-@cache
-def make_native_blocks(name: str) -> Any:
-    """`fill_block` of one fiber, and `move_ends` by the forces `end_force`."""
-    p = precision(name)
-    real, vec3 = p.real, p.vec3
-    Row = elimination_row(name)
-    types = lane_types(name)
-
-    @wp.func_native(types + FILL_BLOCK.replace("MOST_NODES", str(MOST_NODES)))
-    def fill_block(
-        first: wp.int32,
-        segments: wp.int32,
-        base: wp.int32,
-        begin: wp.int32,
-        end: wp.int32,
-        owned: wp.int32,
-        column: wp.int32,
-        h: real,
-        kappa: real,
-        drag_end: real,
-        drag_inner: real,
-        drag_off: real,
-        strength: real,
-        weight: real,
-        weight_excess: real,
-        rows: wp.array(dtype=Row),
-        row_node: wp.array(dtype=wp.vec2i),
-        row_s: wp.array(dtype=real),
-        row_t: wp.array(dtype=real),
-        row_normal: wp.array(dtype=vec3),
-        end_row: wp.array(dtype=wp.int32),
-        block: wp.array(dtype=real),
-    ): ...
-
-    @wp.func_native(types + MOVE_ENDS)
-    def move_ends(
-        begin: wp.int32,
-        end: wp.int32,
-        column: wp.int32,
-        block: wp.array(dtype=real),
-        end_force: wp.array(dtype=real),
-        end_move: wp.array(dtype=real),
-    ): ...
-
-    return fill_block, move_ends
+        for (int k = 0; k <= segments; ++k) {
+            reply[4 * k] = z[k].x;
+            reply[4 * k + 1] = z[k].y;
+            reply[4 * k + 2] = z[k].z;
+            reply[4 * k + 3] = b[k];
+        }
+    };
+""".replace("MOST_NODES", str(MOST_NODES))

@@ -14,8 +14,9 @@ from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-from warpfiber.passes.native_capsules_source import LANES, LINE, PARTS
+from warpfiber.passes.native_capsules_source import LINE, PARTS
 
+LANES = 8  # fibers, in both precisions
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
 

@@ -20,7 +20,7 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    groups fiber_node_start fiber_group segment_node segment_fiber lattice out_start pair_i pair_j
+    groups segment_tips fiber_group segment_node segment_fiber lattice out_start pair_i pair_j
     pair_image place node_velocity node_spin step pair_acts pair_force pair_moment pair_arms
     pair_memory pair_step contact_load status
 """.split()
@@ -42,7 +42,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         friction: real,
         largest_reach: real,
         groups: wp.array(dtype=BondGroup),
-        fiber_node_start: wp.array(dtype=wp.int32),
+        segment_tips: wp.array(dtype=wp.uint8),
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
@@ -74,7 +74,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         friction: real,
         largest_reach: real,
         groups: wp.array(dtype=BondGroup),
-        fiber_node_start: wp.array(dtype=wp.int32),
+        segment_tips: wp.array(dtype=wp.uint8),
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
@@ -104,7 +104,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             friction,
             largest_reach,
             groups,
-            fiber_node_start,
+            segment_tips,
             fiber_group,
             segment_node,
             segment_fiber,

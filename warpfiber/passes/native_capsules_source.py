@@ -9,11 +9,12 @@ Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list.
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
-from warpfiber.passes.native import lane_types, transpose
+from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
-from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE
+from warpfiber.passes.native_capsule_rows import image_constants, row_source
 
-LANES = 8  # pairs, and fibers of `native_bonds`, in both precisions
+# Pairs in both precisions: two registers of eight numbers hide each other's latency.
+LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 LINE = 8  # numbers per node and part: force, moment, two unused
 
@@ -32,71 +33,11 @@ def _constants(name: str, features: CapsuleFeatures) -> str:
         "LINE": LINE,
         "SLOT_HALT": HALT,
         "SLOT_COUNT": PAIR_COUNT,
-        "NO_IMAGE": NO_IMAGE,
-        "BITS": IMAGE_BITS,
-        "MASK": (1 << IMAGE_BITS) - 1,
-        "HALF": 1 << (IMAGE_BITS - 1),
     }
+    numbers |= image_constants()
     lines += [f"constexpr int {key} = {value};" for key, value in numbers.items()]
     return "\n".join(lines)
 
-
-# Three numbers of eight places in an array, as three vectors.
-_ROWS = """
-    typedef double P __attribute__((ext_vector_type(W)));
-    typedef double P4 __attribute__((ext_vector_type(4)));
-    typedef T T4 __attribute__((ext_vector_type(4)));
-    struct P3 { P x, y, z; };
-    auto place_row = [&](long node) -> P4 {
-        const double* x = (const double*)place + 3 * node;
-        return P4{x[0], x[1], x[2], x[2]};
-    };
-    auto real_row = [](const T* from, long at) -> T4 {
-        const T* x = from + 3 * at;
-        return T4{x[0], x[1], x[2], x[2]};
-    };
-    #define TURN(X3, r) \\
-        auto lo0 = __builtin_shufflevector(r[0], r[1], 0, 4, 1, 5); \\
-        auto hi0 = __builtin_shufflevector(r[0], r[1], 2, 6, 3, 7); \\
-        auto lo1 = __builtin_shufflevector(r[2], r[3], 0, 4, 1, 5); \\
-        auto hi1 = __builtin_shufflevector(r[2], r[3], 2, 6, 3, 7); \\
-        auto lo2 = __builtin_shufflevector(r[4], r[5], 0, 4, 1, 5); \\
-        auto hi2 = __builtin_shufflevector(r[4], r[5], 2, 6, 3, 7); \\
-        auto lo3 = __builtin_shufflevector(r[6], r[7], 0, 4, 1, 5); \\
-        auto hi3 = __builtin_shufflevector(r[6], r[7], 2, 6, 3, 7); \\
-        auto lo = __builtin_shufflevector(lo0, lo1, 0, 1, 4, 5, 2, 3, 6, 7); \\
-        auto up = __builtin_shufflevector(lo2, lo3, 0, 1, 4, 5, 2, 3, 6, 7); \\
-        auto z0 = __builtin_shufflevector(hi0, hi1, 0, 1, 4, 5); \\
-        auto z1 = __builtin_shufflevector(hi2, hi3, 0, 1, 4, 5); \\
-        return X3{ \\
-            __builtin_shufflevector(lo, up, 0, 1, 2, 3, 8, 9, 10, 11), \\
-            __builtin_shufflevector(lo, up, 4, 5, 6, 7, 12, 13, 14, 15), \\
-            __builtin_shufflevector(z0, z1, 0, 1, 2, 3, 4, 5, 6, 7)};
-    auto turn_V = [](const T4* r) -> V3 { TURN(V3, r) };
-    auto turn_P = [](const P4* r) -> P3 { TURN(P3, r) };
-    #undef TURN
-    auto narrow = [&](const P4* rows) -> V3 {
-        const P3 u = turn_P(rows);
-        return V3{
-            __builtin_convertvector(u.x, V), __builtin_convertvector(u.y, V),
-            __builtin_convertvector(u.z, V)};
-    };
-    typedef int I __attribute__((ext_vector_type(W)));
-    auto add_images = [&](const int* ks, V3& delta) {
-        if constexpr (IS_PERIODIC) {
-            I code;
-            for (int l = 0; l < W; ++l) ((int*)&code)[l] = pair_image[ks[l]];
-            auto number = [&](int bits) -> V {
-                return __builtin_convertvector(((code >> bits) & MASK) - HALF, V);
-            };
-            const V n0 = number(0), n1 = number(BITS), n2 = number(2 * BITS);
-            const auto& L = lattice[0].data;
-            delta.x += L[0][0] * n0 + L[0][1] * n1 + L[0][2] * n2;
-            delta.y += L[1][0] * n0 + L[1][1] * n1 + L[1][2] * n2;
-            delta.z += L[2][0] * n0 + L[2][1] * n1 + L[2][2] * n2;
-        }
-    };
-"""
 
 # What a pair that begins to act takes over (`contact_memory.neighbors_memory`).
 _HAND_OVER = """
@@ -131,63 +72,69 @@ _LAW = """
     auto law = [&](const int* ks, const T* ss, const T* ts, int count) __attribute__((noinline)) {
         P4 rows_a[W], rows_b[W], rows_d[W], rows_bi[W], rows_ai[W], rows_bj[W], rows_aj[W];
         int node_i[W], node_j[W];
-        T numbers[14][W];
+        T tips[4][W];
         for (int l = 0; l < W; ++l) {
             const int i = pair_i[ks[l]], j = pair_j[ks[l]];
-            node_i[l] = segment_node[i];
-            node_j[l] = segment_node[j];
-            const int fiber_i = segment_fiber[i], fiber_j = segment_fiber[j];
-            const auto& gi = groups[fiber_group[fiber_i]];
-            const auto& gj = groups[fiber_group[fiber_j]];
-            const int at_i = node_i[l] - fiber_node_start[fiber_i];
-            const int at_j = node_j[l] - fiber_node_start[fiber_j];
-            const bool first_i = at_i == 0, last_i = at_i == gi.segments - 1;
-            const bool first_j = at_j == 0, last_j = at_j == gj.segments - 1;
-            const P4 xi = place_row(node_i[l]), xi1 = place_row(node_i[l] + 1);
-            const P4 xj = place_row(node_j[l]), xj1 = place_row(node_j[l] + 1);
+            const long at_i = node_i[l] = segment_node[i], at_j = node_j[l] = segment_node[j];
+            const int tip_i = segment_tips[i], tip_j = segment_tips[j];
+            const int first_i = tip_i & 1, last_i = tip_i >> 1;
+            const int first_j = tip_j & 1, last_j = tip_j >> 1;
+            const P4 xi = place_row(at_i), xi1 = place_row(at_i + 1);
+            const P4 xj = place_row(at_j), xj1 = place_row(at_j + 1);
             rows_a[l] = xi1 - xi;
             rows_b[l] = xj1 - xj;
             rows_d[l] = xj - xi;
-            rows_bi[l] = xi - place_row(node_i[l] - !first_i);
-            rows_ai[l] = place_row(node_i[l] + 1 + !last_i) - xi1;
-            rows_bj[l] = xj - place_row(node_j[l] - !first_j);
-            rows_aj[l] = place_row(node_j[l] + 1 + !last_j) - xj1;
-            numbers[0][l] = T(first_i);
-            numbers[1][l] = T(last_i);
-            numbers[2][l] = T(first_j);
-            numbers[3][l] = T(last_j);
-            numbers[4][l] = gi.radius;
-            numbers[5][l] = gj.radius;
-            numbers[6][l] = gi.compliance;
-            numbers[7][l] = gj.compliance;
-            numbers[8][l] = gi.shear_compliance + gj.shear_compliance;
-            numbers[9][l] = first_i && !gi.closed ? gi.end_mass : gi.mass;
-            numbers[10][l] = last_i && !gi.closed ? gi.end_mass : gi.mass;
-            numbers[11][l] = first_j && !gj.closed ? gj.end_mass : gj.mass;
-            numbers[12][l] = last_j && !gj.closed ? gj.end_mass : gj.mass;
+            rows_bi[l] = xi - place_row(at_i - 1 + first_i);
+            rows_ai[l] = place_row(at_i + 2 - last_i) - xi1;
+            rows_bj[l] = xj - place_row(at_j - 1 + first_j);
+            rows_aj[l] = place_row(at_j + 2 - last_j) - xj1;
+            tips[0][l] = T(first_i);
+            tips[1][l] = T(last_i);
+            tips[2][l] = T(first_j);
+            tips[3][l] = T(last_j);
         }
-        auto number = [&](int n) -> V {
+        if constexpr (HAS_DASHPOT || HAS_FRICTION)  // needed when the normal law is done
+            for (int l = 0; l < W; ++l)
+                for (int end = 0; end < 2; ++end) {
+                    const long far = 3L * (node_j[l] + end);
+                    __builtin_prefetch((const T*)node_velocity + far);
+                    __builtin_prefetch((const T*)node_spin + far);
+                    __builtin_prefetch(load + (long)LINE * (node_j[l] + end), 1);
+                }
+        if constexpr (HAS_FRICTION)
+            for (int l = 0; l < W; ++l) {
+                __builtin_prefetch(kept_last + 4L * ks[l]);
+                __builtin_prefetch(kept_now + 4L * ks[l], 1);
+            }
+        auto of = [](const T* from) -> V {
             V v;
-            __builtin_memcpy(&v, numbers[n], sizeof(V));
+            __builtin_memcpy(&v, from, sizeof(V));
             return v;
         };
-        const V3 a = narrow(rows_a), b = narrow(rows_b);
-        V3 delta = narrow(rows_d);
+        // a constant of the group of one fiber of every pair
+        auto constant = [&](const int* owner, auto field) -> V {
+            if (one_group) return V(T(0)) + field(groups[0]);
+            V v;
+            for (int l = 0; l < W; ++l)
+                ((T*)&v)[l] = field(groups[fiber_group[segment_fiber[owner[ks[l]]]]]);
+            return v;
+        };
+        #define OF(owner, name) constant(owner, [](const auto& g) -> T { return g.name; })
+        const V3 a = turn(rows_a), b = turn(rows_b);
+        V3 delta = turn(rows_d);
         add_images(ks, delta);
-        const V3 back_i = narrow(rows_bi), ahead_i = narrow(rows_ai);
-        const V3 back_j = narrow(rows_bj), ahead_j = narrow(rows_aj);
-        const M tip0_i = number(0) > T(0), tip1_i = number(1) > T(0);
-        const M tip0_j = number(2) > T(0), tip1_j = number(3) > T(0);
-        const V radius_i = number(4), radius_j = number(5);
-        const V compliance_i = number(6), compliance_j = number(7);
-        V s, t;
-        __builtin_memcpy(&s, ss, sizeof(V));
-        __builtin_memcpy(&t, ts, sizeof(V));
+        const V3 back_i = turn(rows_bi), ahead_i = turn(rows_ai);
+        const V3 back_j = turn(rows_bj), ahead_j = turn(rows_aj);
+        const M tip0_i = of(tips[0]) > T(0), tip1_i = of(tips[1]) > T(0);
+        const M tip0_j = of(tips[2]) > T(0), tip1_j = of(tips[3]) > T(0);
+        const V radius_i = OF(pair_i, radius), radius_j = OF(pair_j, radius);
+        const V compliance_i = OF(pair_i, compliance), compliance_j = OF(pair_j, compliance);
+        V s = of(ss), t = of(ts);
         NORMAL
         const M acts = force > T(0);
         typedef bool B __attribute__((ext_vector_type(W)));
         const B bits = __builtin_convertvector(acts, B);
-        const unsigned mine = __builtin_bit_cast(unsigned char, bits) & ((1u << count) - 1u);
+        const unsigned mine = __builtin_bit_cast(unsigned short, bits) & ((1u << count) - 1u);
         if (mine == 0) return;
 
         const V3 c = delta + b * t - a * s;
@@ -201,9 +148,9 @@ _LAW = """
             T4 r[W];
             auto between = [&](const T* of, const int* node, V part) -> V3 {
                 for (int l = 0; l < W; ++l) r[l] = real_row(of, node[l]);
-                const V3 start = turn_V(r);
+                const V3 start = turn(r);
                 for (int l = 0; l < W; ++l) r[l] = real_row(of, node[l] + 1);
-                return start * (T(1) - part) + turn_V(r) * part;
+                return start * (T(1) - part) + turn(r) * part;
             };
             const V3 vi = between((const T*)node_velocity, node_i, s);
             const V3 vj = between((const T*)node_velocity, node_j, t);
@@ -212,14 +159,19 @@ _LAW = """
             const V3 slip = vi - vj + (wi * arm_i + wj * arm_j).cross(n);
             const V approach = slip.dot(n);
             const V rest_s = T(1) - s, rest_t = T(1) - t;
-            const V mass = T(1) / (rest_s * rest_s / number(9) + s * s / number(10)
-                + rest_t * rest_t / number(11) + t * t / number(12));
+            const V in_i = OF(pair_i, mass), in_j = OF(pair_j, mass);
+            const V tip_i = OF(pair_i, closed ? g.mass : g.end_mass);
+            const V tip_j = OF(pair_j, closed ? g.mass : g.end_mass);
+            const V mass = T(1) / (rest_s * rest_s / (tip0_i ? tip_i : in_i)
+                + s * s / (tip1_i ? tip_i : in_i) + rest_t * rest_t / (tip0_j ? tip_j : in_j)
+                + t * t / (tip1_j ? tip_j : in_j));
             if constexpr (HAS_DASHPOT) {
                 const V resistance = DASHPOT * beta * root(stiffness * mass);
                 size = larger(size + resistance * approach, V(T(0)));
             }
             if constexpr (HAS_FRICTION) {
-                const V k = T(4) * (compliance_i + compliance_j) / number(8) * stiffness;
+                const V shear = OF(pair_i, shear_compliance) + OF(pair_j, shear_compliance);
+                const V k = T(4) * (compliance_i + compliance_j) / shear * stiffness;
                 const V3 slide = slip - n * approach;
                 const V turn = T(0.5) * dt * (wi + wj).dot(n);
                 const V far_i = la * smaller(s, rest_s), far_j = lb * smaller(t, rest_t);
@@ -231,21 +183,16 @@ _LAW = """
                     if (__builtin_expect(written_last[from] != last, 0)) {
                         const int i = pair_i[from], j = pair_j[from];
                         const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
-                        const int to_i = s_l < T(0.5) ? -(numbers[0][l] == T(0))
-                                                      : (numbers[1][l] == T(0));
-                        const int to_j = t_l < T(0.5) ? -(numbers[2][l] == T(0))
-                                                      : (numbers[3][l] == T(0));
+                        const int to_i = s_l < T(0.5) ? -(tips[0][l] == T(0))
+                                                      : (tips[1][l] == T(0));
+                        const int to_j = t_l < T(0.5) ? -(tips[2][l] == T(0))
+                                                      : (tips[3][l] == T(0));
                         from = neighbors_memory(
                             from, i + to_i, j + to_j, ((const T*)&far_i)[l], ((const T*)&far_j)[l]);
                         if (from < 0) continue;
                     }
                     for (int m = 0; m < 4; ++m) kept[m][l] = kept_last[4L * from + m];
                 }
-                auto of = [](const T* from) -> V {
-                    V v;
-                    __builtin_memcpy(&v, from, sizeof(V));
-                    return v;
-                };
                 const V3 h = {of(kept[0]), of(kept[1]), of(kept[2])};
                 const V before = of(kept[3]);
                 V3 flat = h - n * h.dot(n);
@@ -271,18 +218,21 @@ _LAW = """
         }
         const V3 whole = drag - n * size;
         const V3 moment = n.cross(whole);
-        V on_i[W] = {
+        V numbers[8] = {
             whole.x, whole.y, whole.z, moment.x * arm_i, moment.y * arm_i, moment.z * arm_i};
-        V on_j[W] = {
-            -whole.x, -whole.y, -whole.z, moment.x * arm_j, moment.y * arm_j, moment.z * arm_j};
-        on_i[6] = on_i[7] = on_j[6] = on_j[7] = V(T(0));
-        TURN_I
-        TURN_J
+        numbers[6] = numbers[7] = V(T(0));
+        T8 on_i[W], on_j[W];
+        turn_back(numbers, on_i);
+        for (int c = 0; c < 3; ++c) numbers[c] = -numbers[c];
+        numbers[3] = moment.x * arm_j;
+        numbers[4] = moment.y * arm_j;
+        numbers[5] = moment.z * arm_j;
+        turn_back(numbers, on_j);
         for (unsigned left = mine; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
-            auto add = [&](int node, V values) {
-                U* to = (U*)(load + (long)LINE * node);
-                *to += values;
+            auto add = [&](int node, T8 values) {
+                typedef T U8 __attribute__((ext_vector_type(8), aligned(sizeof(T))));
+                *(U8*)(load + (long)LINE * node) += values;
             };
             const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
             add(node_i[l], on_i[l] * (T(1) - s_l));
@@ -333,8 +283,8 @@ _SWEEP = """
             rows_b[l] = place_row(node_j + 1) - xj;
             rows_d[l] = xj - xi;
         }
-        const V3 a = narrow(rows_a), b = narrow(rows_b);
-        V3 delta = narrow(rows_d);
+        const V3 a = turn(rows_a), b = turn(rows_b);
+        V3 delta = turn(rows_d);
         add_images(ks, delta);
         const V aa = larger(a.dot(a), V(TINY)), bb = larger(b.dot(b), V(TINY));
         const V ab = a.dot(b), da = delta.dot(a), db = delta.dot(b);
@@ -375,11 +325,10 @@ _SWEEP = """
 def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
     law = _LAW.replace("NORMAL", NORMAL)
-    for key, rows in (("TURN_I", "on_i"), ("TURN_J", "on_j")):
-        law = law.replace(key, transpose(LANES, rows))
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
     const int kept_size = pair_step.shape[1], node_count = place.shape[0];
+    const bool one_group = groups.shape[0] == 1;
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
@@ -388,7 +337,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     if (status[SLOT_HALT] != 0) return;
     const V3 nothing3 = same3(0, 0, 0);
     T* const load = contact_load + (long)LINE * node_count * part;
-    {_ROWS}
+    {row_source()}
     {POWERS}
     {_HAND_OVER}
     {law}

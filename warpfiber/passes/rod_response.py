@@ -10,6 +10,7 @@ Limits: the direction is that of the start of the step, where the rows were made
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -18,6 +19,7 @@ from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
+from warpfiber.passes.rod_relaxation import PLACE_NUMBERS, ROD_NUMBERS, make_rod_relaxation
 from warpfiber.passes.unilateral import ContactDual
 
 
@@ -134,6 +136,7 @@ class RodResponse:
     by_ends = False
 
     def __init__(self, model: Model) -> None:
+        self.relaxes = model.device.startswith("cpu")
         self.row_end = wp.zeros(0, dtype=wp.int32, device=model.device)
         self.end_move = wp.zeros(0, dtype=model.precision.real, device=model.device)
 
@@ -166,6 +169,47 @@ class RodResponse:
         ]
         kernel = make_rod_response(model.precision.name, dual.has_frozen, dual.module)
         return Launch("rod_response", kernel, model.fiber_count, inputs, split=True)
+
+    def relax(self, dual: ContactDual) -> list[Launch | Call]:
+        """Forces and shifts of the solution."""
+        model, rows, law = dual.model, dual.rows, dual.law
+        fibers, capacity = model.fiber_count, rows.row_i.shape[0]
+
+        def reals(size: int) -> Any:
+            return wp.zeros(size, dtype=model.precision.real, device=model.device)
+
+        work = [reals(ROD_NUMBERS * (fibers + 1)), reals(PLACE_NUMBERS * capacity)]
+        inputs = [
+            fibers,
+            dual.most,
+            wp.float64(dual.tolerance),
+            law.stiffness,
+            law.decay,
+            dual.step_size,
+            model.groups,
+            model.fiber_group,
+            model.segment_fiber,
+            dual.fiber_frozen,
+            dual.node_start,
+            rows.row_count,
+            rows.row_out_start,
+            rows.row_i,
+            rows.row_j,
+            rows.row_s,
+            rows.row_t,
+            rows.row_normal,
+            rows.row_base,
+            rows.row_compliance,
+            *work,
+            *dual.relaxation_work(),
+            dual.state.status,
+            rows.row_force,
+            dual.node_shift,
+            dual.best,
+            dual.control,
+        ]
+        kernel = make_rod_relaxation(model.precision.name, law.kind, dual.module)
+        return [Launch("rod_relax", kernel, 1, inputs)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
         """Moves the rods by the solution."""

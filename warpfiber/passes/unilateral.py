@@ -2,7 +2,9 @@
 
 A solve: weights of the rows and their lists by fiber, then repeatedly the next forces, the response
 of the fibers and the balance of the rows (`dual_rows`), until the largest fault is within the
-tolerance or `most` updates were made. Every launch does nothing once that is so.
+tolerance or `most` updates were made. Every launch does nothing once that is so. On the CPU one
+launch instead, which relaxes row after row (`native_relaxation`) and counts as many relaxations as
+there are rows as an update.
 Limits: the response is linear in the forces and symmetric; see `rod_response`, `chain_response`.
 """
 
@@ -61,12 +63,16 @@ class Response(Protocol):
     by_ends: bool  # it makes `row_end` and `end_move`, see `dual_rows.make_dual_balance`
     row_end: Any
     end_move: Any
+    relaxes: bool  # on this device
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
         """Launches after the lists of the fibers."""
 
     def repeat(self, dual: ContactDual) -> Launch:
         """The motion by the present forces, in every update."""
+
+    def relax(self, dual: ContactDual) -> list[Launch | Call]:
+        """Instead of all that: forces and shifts by `native_relaxation`, where `relaxes`."""
 
     def end(self, dual: ContactDual) -> list[Launch | Call]:
         """Launches that leave `node_shift` of the solution."""
@@ -102,12 +108,14 @@ class ContactDual:
         most: int = MOST_UPDATES,
         fiber_frozen: Any = None,
         chunks: tuple[int, int] | None = None,
+        relaxes: bool | None = None,
     ) -> None:
         self.model, self.state, self.rows, self.pairs = model, state, rows, pairs
         self.response = response
         self.step_size, self.node_start = step_size, node_start
         self.tolerance, self.most = tolerance, most
         self.law = law or ContactLaw()
+        self.relaxes = response.relaxes if relaxes is None else relaxes
         device = model.device
         self.has_frozen = fiber_frozen is not None
         none = wp.zeros(0, dtype=wp.uint8, device=device)
@@ -143,6 +151,8 @@ class ContactDual:
 
     def launches(self) -> list[Launch | Call | Repeat]:
         """Begin, lists and the repeated updates of one solve."""
+        if self.relaxes:
+            return [*self.response.relax(self)]
         self._allocate()
         before = [self._begin(), self._lists(), *self.response.begin(self)]
         update: list[Launch | Call] = [self._step(), self.response.repeat(self), self._balance()]
@@ -256,6 +266,17 @@ class ContactDual:
         name, by_ends = self.model.precision.name, self.response.by_ends
         kernel = make_dual_balance(name, self.law.kind, by_ends, self.module)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
+
+    def relaxation_work(self) -> list[Any]:
+        """What `native_relaxation` keeps: rows, rows by partner, and the queue of fibers."""
+        fibers, rows, device = self.model.fiber_count, self.rows.row_i.shape[0], self.model.device
+        return [
+            wp.zeros(4 * rows, dtype=self.model.precision.real, device=device),
+            wp.zeros(fibers + 2, dtype=wp.int32, device=device),
+            wp.zeros(rows, dtype=wp.int32, device=device),
+            wp.zeros(fibers, dtype=wp.uint8, device=device),
+            wp.zeros(fibers, dtype=wp.int32, device=device),
+        ]
 
     # -- what is told -----------------------------------------------------------------------------
 

@@ -1,0 +1,192 @@
+"""What bonds, walls and the damping of a stage dissipate in a step of bonded spheres.
+
+One thread per fiber adds to its sums. The loads of a step are found with the speeds amid it,
+v - a dt / 2; around them they do the work F . v dt (see `contact_energy`).
+Source: laws `bond`, `hertz` and `friction`. Friction on walls: work put in against it; what its
+    memories store is told by `bond_energy`.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpfiber.laws.bond import make_bond
+from warpfiber.laws.friction import make_friction
+from warpfiber.laws.hertz import DASHPOT, make_hertz
+from warpfiber.model import HALT, precision
+from warpfiber.passes.bond_groups import bond_group_struct, node_struct
+from warpfiber.passes.bonds import SETTLING, BondFeatures
+from warpfiber.passes.node_walls import SIDES
+
+LOST = ("bonds", "settling", "walls", "wall friction")  # columns
+
+
+@cache
+def make_bond_losses(name: str, features: BondFeatures):
+    """Kernel `bond_losses`: adds to the columns LOST of every fiber."""
+    p = precision(name)
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    BondGroup = bond_group_struct(name)
+    Node = node_struct(name)
+    _, _, bond_dashpots = make_bond(name)
+    plane_stiffness, plane_push, _ = make_hertz(name)
+    _, friction_force = make_friction(name)
+    wall_x, wall_y, wall_z = features.walls
+    has_walls, has_friction = any(features.walls), features.wall_friction
+    has_dashpots = features.dashpots
+    zero, half = real(0.0), real(0.5)
+    spring_part, dashpot = real(2.0 / 3.0), real(DASHPOT)
+
+    @wp.func
+    def node_at(
+        i: wp.int32,
+        back: real,
+        place: wp.array(dtype=wp.vec3d),
+        node_velocity: wp.array(dtype=vec3),
+        node_spin: wp.array(dtype=vec3),
+        node_rate: wp.array(dtype=vec3),
+        node_spin_rate: wp.array(dtype=vec3),
+    ) -> Node:
+        """Place, and speeds a time `back` ago (0: now)."""
+        node = Node()
+        node.x = place[i]
+        node.v = node_velocity[i] - back * node_rate[i]
+        node.w = node_spin[i] - back * node_spin_rate[i]
+        return node
+
+    @wp.func
+    def bond_loss(c: vec4, amid_i: Node, amid_j: Node, now_i: Node, now_j: Node) -> real:
+        d = vec3(now_j.x - now_i.x)
+        force, moment = bond_dashpots(c, d, amid_j.v - amid_i.v, amid_i.w, amid_j.w)
+        slip = now_j.v - now_i.v - half * wp.cross(now_i.w + now_j.w, d)
+        return wp.dot(force, slip) + wp.dot(moment, now_j.w - now_i.w)
+
+    @wp.func
+    def wall_loss(
+        g: BondGroup,
+        beta: real,
+        friction: real,
+        mass: real,
+        amid: Node,
+        now: Node,
+        n: vec3,
+        gap: real,
+        approach: real,
+        slot: wp.int32,
+        memories: wp.array(dtype=vec3),
+    ):
+        """Of the dashpot, and what friction takes; n points into the box."""
+        depth = g.radius - gap
+        if depth <= zero:
+            return zero, zero
+        k = plane_stiffness(g.wall_modulus, g.radius, depth)
+        size = plane_push(k, beta, mass, depth, wp.dot(amid.v, n) - approach)
+        lost = (spring_part * k * depth - size) * (wp.dot(now.v, n) - approach)
+        rubbed = zero
+        if wp.static(has_friction):
+            arm = -gap * n
+            slide = amid.v + wp.cross(amid.w, arm)
+            slide -= wp.dot(slide, n) * n
+            stiffness = real(4.0) * g.compliance / g.shear_compliance * k
+            resistance = dashpot * beta * wp.sqrt(stiffness * mass)
+            force, _h = friction_force(
+                memories[slot], stiffness, resistance, slide, friction * size
+            )
+            rubbed = -wp.dot(force, now.v + wp.cross(now.w, arm))
+        return lost, rubbed
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def bond_losses(
+        offset: wp.int32,
+        dt: wp.float64,
+        press: wp.int32,
+        wall_place: wp.array(dtype=wp.vec3d),
+        wall_velocity: wp.array(dtype=wp.vec2d),
+        wall_damping: real,
+        wall_friction: real,
+        stage: wp.array(dtype=real),
+        groups: wp.array(dtype=BondGroup),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        wall_memory: wp.array(dtype=vec3),
+        place: wp.array(dtype=wp.vec3d),
+        node_velocity: wp.array(dtype=vec3),
+        node_spin: wp.array(dtype=vec3),
+        node_rate: wp.array(dtype=vec3),
+        node_spin_rate: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        lost: wp.array2d(dtype=wp.float64),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        fiber = wp.tid() + offset
+        g = groups[fiber_group[fiber]]
+        first = fiber_node_start[fiber]
+        last = fiber_node_start[fiber + 1] - 1
+        settling = stage[wp.static(SETTLING)]
+        back = half * real(dt)
+        in_bonds = wp.float64(0.0)
+        in_settling = wp.float64(0.0)
+        at_walls = wp.float64(0.0)
+        rubbed = wp.float64(0.0)
+        for i in range(first, last + 1):
+            mass = g.mass
+            inertia = g.inertia
+            if (i == first or i == last) and g.closed == 0:
+                mass = g.end_mass
+                inertia = g.end_inertia
+            amid = node_at(i, back, place, node_velocity, node_spin, node_rate, node_spin_rate)
+            now = node_at(i, zero, place, node_velocity, node_spin, node_rate, node_spin_rate)
+            damped = mass * wp.dot(amid.v, now.v) + inertia * wp.dot(amid.w, now.w)
+            in_settling += wp.float64(settling * damped)
+            if wp.static(has_dashpots):
+                j = i + 1
+                if i == last:
+                    j = first
+                if i < last or g.closed == 1:
+                    amid_j = node_at(
+                        j, back, place, node_velocity, node_spin, node_rate, node_spin_rate
+                    )
+                    now_j = node_at(
+                        j, zero, place, node_velocity, node_spin, node_rate, node_spin_rate
+                    )
+                    in_bonds += wp.float64(bond_loss(g.dashpots, amid, amid_j, now, now_j))
+            if wp.static(has_walls):
+                for axis in range(3):
+                    has_wall = wp.static(wall_x)
+                    if axis == 1:
+                        has_wall = wp.static(wall_y)
+                    if axis == 2:
+                        has_wall = wp.static(wall_z)
+                    if has_wall:
+                        for side in range(2):
+                            n = vec3(zero, zero, zero)
+                            n[axis] = real(1 - 2 * side)
+                            gap = real(now.x[axis] - wall_place[side][axis])
+                            if side == 1:
+                                gap = -gap
+                            approach = zero
+                            if axis == press:
+                                approach = n[axis] * real(wall_velocity[0][side])
+                            slot = wp.static(SIDES) * i + 2 * axis + side
+                            loss, slid = wall_loss(
+                                g,
+                                wall_damping,
+                                wall_friction,
+                                mass,
+                                amid,
+                                now,
+                                n,
+                                gap,
+                                approach,
+                                slot,
+                                wall_memory,
+                            )
+                            at_walls += wp.float64(loss)
+                            rubbed += wp.float64(slid)
+        lost[fiber, 0] = lost[fiber, 0] + dt * in_bonds
+        lost[fiber, 1] = lost[fiber, 1] + dt * in_settling
+        lost[fiber, 2] = lost[fiber, 2] + dt * at_walls
+        lost[fiber, 3] = lost[fiber, 3] + dt * rubbed
+
+    return bond_losses
