@@ -22,7 +22,6 @@ import warp as wp
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
-    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
@@ -31,6 +30,8 @@ from warpfiber.methods.bonded_launches import (
 from warpfiber.methods.energies import Energies
 from warpfiber.methods.grips import Grips
 from warpfiber.methods.method import Method
+from warpfiber.methods.native_bonds import NativeBonds
+from warpfiber.methods.pair_search import STEP_PAIR_COST
 from warpfiber.methods.press import Press
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_groups import bond_group_struct
@@ -38,6 +39,7 @@ from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
 from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
@@ -101,14 +103,17 @@ class BondedSpheres(Method):
         self.place = state.node_pos
         if p.name == "float32":
             self.place = wp.zeros(nodes, dtype=wp.vec3d, device=device)
+        vectors = NATIVE and native_bonds_apply(model, self.features)
         self.contacts: BondedContacts | None = None
         if self.features.pairs:
             stretch = float(self._segment_stretch().max())
-            self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
+            self.contacts = BondedContacts(
+                scene, model, state, self.workers, stretch, PAIR_COST if vectors else STEP_PAIR_COST
+            )
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
         self.native: NativeBonds | None = None
-        if NATIVE and native_bonds_apply(model, self.features):
+        if vectors:
             self.native = NativeBonds(self)
         self.energies = Energies(self)
 
@@ -187,7 +192,9 @@ class BondedSpheres(Method):
             self.place.assign(self.state.node_pos.numpy().astype(float))
         first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
-            if self.contacts.build(self.step_count):
+            replaced = self.contacts.build(self.step_count)
+            self._find_near()
+            if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
             pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
@@ -213,15 +220,27 @@ class BondedSpheres(Method):
         status = self._status()
         if status[TORN]:
             return False
+        if status[EXPIRED] and self.native is not None and self.native.near.lasts():
+            self.native.near.find()
+            status[EXPIRED] = 0
         if status[EXPIRED] and self.contacts is not None:
             replaced = self.contacts.expire(self.step_count)
-            if replaced is None:
+            if replaced is None or not self._find_near():
                 remedy = "fibers move farther in one step than any skin; give a smaller dt"
                 raise SceneError([Fault(self.scene.path, "numerics.dt", None, remedy)])
             if replaced:
                 self._stop_executor()
             self.list_seconds = self.contacts.search.seconds
         return True
+
+    def _find_near(self) -> bool:
+        """Near pairs of a new list; False if they do not last a step."""
+        if self.native is None:
+            return True
+        near = self.native.near
+        lasting = near.lasts() or near.lasts_a_step()
+        near.find()
+        return lasting
 
     def list_report(self) -> dict[str, float]:
         """What the search for pairs did; nothing without a list."""
@@ -232,6 +251,8 @@ class BondedSpheres(Method):
         super().close()
         if self.contacts is not None:
             self.contacts.search.close()
+        if self.native is not None:
+            self.native.near.close()
 
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
         """Take over the damping of a stage; count anew how long all nodes have been still."""
@@ -298,6 +319,8 @@ class BondedSpheres(Method):
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
         arrays |= self.press.saved() | self.grips.saved() | self.energies.saved()
+        if self.native is not None:
+            arrays |= self.native.near.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -310,6 +333,8 @@ class BondedSpheres(Method):
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
+            if self.native is not None:
+                self.native.near.restore(arrays)
             self._stop_executor()
 
     def torn_fiber(self) -> dict[str, Any]:

@@ -29,8 +29,8 @@ LEAST_NODES, MOST_NODES = LANES, 256
 FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    list_sizes stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
-    node_grip contact_load node_touches node_push node_couple list_pos place node_pos node_velocity
+    near_skin stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
+    node_grip contact_load node_touches node_push node_couple near_pos place node_pos node_velocity
     node_turn node_spin node_rate node_spin_rate still_steps status block_fiber block_own
 """.split()
 
@@ -64,7 +64,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         block: wp.int32,
         phase: wp.int32,
         dt: real,
-        list_sizes: wp.array(dtype=real),
+        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -78,7 +78,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        list_pos: wp.array(dtype=vec3),
+        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -119,7 +119,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         wall_friction: real,
         wall_memory: wp.array(dtype=vec3),
         wall_depth: wp.array(dtype=real),
-        list_sizes: wp.array(dtype=real),
+        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -133,7 +133,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        list_pos: wp.array(dtype=vec3),
+        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -196,7 +196,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             block,
             phase,
             dt,
-            list_sizes,
+            near_skin,
             stage,
             groups,
             fiber_node_start,
@@ -210,7 +210,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             node_touches,
             node_push,
             node_couple,
-            list_pos,
+            near_pos,
             place,
             node_pos_out,
             node_velocity,

@@ -140,7 +140,8 @@ _HOLD = """
 
 _MOVE = """
     const V kick = V(T(0.5) * dt);
-    V fastest2 = V(T(0)), furthest = V(T(0));
+    V fastest2 = V(T(0));
+    M expired = V(T(1)) < T(0);
     for (int k = 0; k < nodes; ++k) {
         V3 speed = get(v, k), spin = get(w, k);
         if (loads) {
@@ -185,12 +186,13 @@ _MOVE = """
             q[4 * k + 2] = vector.z * back;
             q[4 * k + 3] = scalar * back;
             if constexpr (HAS_PAIRS) {
-                const V3 now = {narrow(at.x), narrow(at.y), narrow(at.z)};
-                const V3 moved = now - get(listed, k);
+                const P3 was = get_P(near, k);
+                const V3 moved = {
+                    narrow(at.x - was.x), narrow(at.y - was.y), narrow(at.z - was.z)};
                 const V far = __builtin_elementwise_sqrt(moved.dot(moved))
                     + dt * __builtin_elementwise_sqrt(speed.dot(speed));
-                furthest = far > furthest ? far : furthest;
-                if (IS_SINGLE) put(listed, k, now);
+                expired |= ~(far <= skin[k]);
+                if (IS_SINGLE) put(listed, k, V3{narrow(at.x), narrow(at.y), narrow(at.z)});
             }
         }
         put(v, k, speed);
@@ -205,12 +207,9 @@ _STORE = """
         store_P(3, (double*)place, x);
         store_V(4, (T*)node_turn, q);
         if (IS_SINGLE && HAS_PAIRS) store_V(3, (T*)node_pos, listed);
-        if constexpr (HAS_PAIRS) {
-            const M expired = ~(furthest <= T(0.5) * list_sizes[1]);
-            if (any(expired))
-                for (int l = 0; l < own; ++l)
-                    if (expired[l]) status[SLOT_EXPIRED] = 1;
-        }
+        if (any(expired))
+            for (int l = 0; l < own; ++l)
+                if (expired[l]) status[SLOT_EXPIRED] = 1;
     } else {
         store_V(3, (T*)node_rate, a);
         store_V(3, (T*)node_spin_rate, b);
@@ -230,15 +229,17 @@ _SWEEP = """
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
     const bool loads = phase & LOADS, ends = phase & END, begins = phase & BEGIN;
 
-    P* x = (P*)__builtin_alloca_with_align(3 * nodes * sizeof(P), 512);
-    V* v = (V*)__builtin_alloca_with_align(23 * nodes * sizeof(V), 512);
+    P* x = (P*)__builtin_alloca_with_align(6 * nodes * sizeof(P), 512);
+    P* near = x + 3 * nodes;
+    V* v = (V*)__builtin_alloca_with_align(24 * nodes * sizeof(V), 512);
     V* w = v + 3 * nodes;
     V* q = w + 3 * nodes;
     V* a = q + 4 * nodes;
     V* b = a + 3 * nodes;
     V* axis = b + 3 * nodes;
     V* length = axis + 3 * nodes;
-    V* listed = length + nodes;
+    V* skin = length + nodes;
+    V* listed = skin + nodes;
     struct P3 { P x, y, z; };
     struct V4 { V3 v; V s; };
     auto get = [](const V* u, int k) -> V3 { return V3{u[3 * k], u[3 * k + 1], u[3 * k + 2]}; };
@@ -260,7 +261,10 @@ _LOAD = """
     load_V(3, v, (const T*)node_velocity);
     load_V(4, q, (const T*)node_turn);
     load_V(3, w, (const T*)node_spin);
-    if (begins && HAS_PAIRS) load_V(3, listed, (const T*)list_pos);
+    if (begins && HAS_PAIRS) {
+        load_P(3, near, (const double*)near_pos);
+        load_V(1, skin, near_skin);
+    }
     if (loads) {
         load_V(3, axis, (const T*)bond_axis);
         load_V(1, length, (const T*)bond_length);

@@ -1,6 +1,6 @@
 """The pair sweep of bonded spheres on the CPU: distances and contacts of eight pairs at a time.
 
-A pair is a lane, and nothing in a lane depends on the others. The list is cut into PARTS; each adds
+A pair is a lane, and nothing in a lane depends on the others. Near pairs are in PARTS; each adds
 the loads of its contacts to a line of numbers per node of its own, which the sweep over bonds adds
 up in turn, so a sum does not depend on the number of workers. What a pair does is stored by pair
 only if asked for: most of the time would go into that.
@@ -20,15 +20,15 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    groups segment_tips fiber_group segment_node segment_fiber lattice out_start pair_i pair_j
-    pair_image place node_velocity node_spin step pair_acts pair_force pair_moment pair_arms
-    pair_memory pair_step contact_load status
+    groups segment_tips fiber_group segment_node segment_fiber lattice out_start part_start
+    near_count near_pair near_i near_j pair_i pair_j pair_image place node_velocity node_spin step
+    pair_acts pair_force pair_moment pair_arms pair_memory pair_step contact_load status
 """.split()
 
 
 @cache
 def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
-    """Kernel `native_capsule_pairs` over the PARTS of the list."""
+    """Kernel `native_capsule_pairs` over the PARTS of the near pairs."""
     p = precision(name)
     real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
@@ -48,6 +48,11 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         segment_fiber: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
+        part_start: wp.array(dtype=wp.int32),
+        near_count: wp.array(dtype=wp.int32),
+        near_pair: wp.array(dtype=wp.int32),
+        near_i: wp.array(dtype=wp.int32),
+        near_j: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -80,6 +85,11 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         segment_fiber: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
+        part_start: wp.array(dtype=wp.int32),
+        near_count: wp.array(dtype=wp.int32),
+        near_pair: wp.array(dtype=wp.int32),
+        near_i: wp.array(dtype=wp.int32),
+        near_j: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -110,6 +120,11 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             segment_fiber,
             lattice,
             out_start,
+            part_start,
+            near_count,
+            near_pair,
+            near_i,
+            near_j,
             pair_i,
             pair_j,
             pair_image,
