@@ -33,6 +33,7 @@ class Laws:
     poisson: float = 0.5
     damping: float = 0.0
     friction: float = 0.0
+    clamp: bool = True  # contacts never pull
     memories: Memories = field(default_factory=dict)
 
     @property
@@ -233,7 +234,8 @@ def contact_loads(
         slip = speeds[0] - speeds[1]
         damper = 2.0 * math.sqrt(5.0 / 6.0) * laws.damping
         resistance = damper * math.sqrt(found.stiffness / softness)
-        size = max(found.force + resistance * float(slip @ n), 0.0)
+        size = found.force + resistance * float(slip @ n)
+        size = max(size, 0.0) if laws.clamp else size
         force = -size * n
         if laws.friction > 0.0:
             stiffness = laws.shear_ratio * found.stiffness

@@ -267,10 +267,11 @@ def test_flags() -> None:
     sim = crowd()
     sim.prepare()
     native = sim.method.native  # type: ignore[attr-defined]
+    native.near.skin.fill_(10.0)
     assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 0
-    far = sim.state.list_pos.numpy()
-    far[-1, 0] += 1.0
-    sim.state.list_pos.assign(far)
+    skin = native.near.skin.numpy()
+    skin[-1] = 0.0
+    native.near.skin.assign(skin)
     assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 1
     words = sim.state.status.numpy().copy()
     words[HALT] = 1

@@ -11,7 +11,6 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
@@ -28,11 +28,9 @@ from warpfiber.methods.bonded_launches import (
     pair_launch,
 )
 from warpfiber.methods.energies import Energies
-from warpfiber.methods.grips import Grips
 from warpfiber.methods.method import Method
 from warpfiber.methods.native_bonds import NativeBonds
 from warpfiber.methods.pair_search import STEP_PAIR_COST
-from warpfiber.methods.press import Press
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
@@ -44,10 +42,8 @@ from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.gripping import GRIPPING
-from warpfiber.scene.pressing import PRESSING
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
-STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
@@ -67,9 +63,8 @@ class BondedSpheres(Method):
         super().__init__(scene, model, state, dt, workers)
         p, device, nodes = model.precision, model.device, model.node_count
         self.started = False
-        self.press = Press(scene, model, state, self.dt)
-        self.grips = Grips(scene, model, state, self.dt)
-        self.holds = self.grips.holds
+        self.bed = BedStages(self)
+        self.press, self.grips, self.holds = self.bed.press, self.bed.grips, self.bed.holds
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
@@ -98,7 +93,6 @@ class BondedSpheres(Method):
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
         self.wall_depth = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
-        self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
         # float64 in every precision: world positions in float32 lose slow motion
         self.place = state.node_pos
         if p.name == "float32":
@@ -173,6 +167,11 @@ class BondedSpheres(Method):
         ]
 
     @property
+    def counted_fibers(self) -> int:
+        """Those that are poured; at least one, so that there is something to measure."""
+        return max(1, self.bed.pour.count)
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units; with the start skin."""
         return self.contacts.search.box_width if self.contacts is not None else 0.0
@@ -242,6 +241,15 @@ class BondedSpheres(Method):
         near.find()
         return lasting
 
+    def rebuild_list(self) -> None:
+        """List the pairs of the present positions: some node was set elsewhere."""
+        if self.contacts is None:
+            return
+        replaced = self.contacts.build(self.step_count)
+        self._find_near()
+        if replaced:
+            self._stop_executor()
+
     def list_report(self) -> dict[str, float]:
         """What the search for pairs did; nothing without a list."""
         return self.contacts.search.report(self.step_count) if self.contacts is not None else {}
@@ -254,46 +262,33 @@ class BondedSpheres(Method):
         if self.native is not None:
             self.native.near.close()
 
+    # -- stages -----------------------------------------------------------------------------------
+
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
-        """Take over the damping of a stage; count anew how long all nodes have been still."""
+        """Take over the damping of a stage and what it does to the bed."""
         units = self.model.units
         numbers = np.zeros(STAGE_SIZE, dtype=self.model.precision.numpy)
         numbers[SETTLING] = stage.damping * units.time
         numbers[END_SPEED] = ((stage.end_speed or 0.0) / units.velocity) ** 2
         self.stage.assign(numbers)
-        nodes = self._nodes()
-        gripped = self.grips.begin(stage, nodes, resumed=resumed)
-        if not resumed:
-            self.still_steps.zero_()
-            self.press.begin(stage, nodes)
-            self._move_as_told(gripped)
+        self.bed.begin_stage(stage, resumed=resumed)
 
-    def _nodes(self) -> np.ndarray:
-        """(N, 3) positions now, run units, as exact as they are kept."""
-        nodes = self.place if self.started else self.state.node_pos
-        found: np.ndarray = nodes.numpy().astype(float)
-        return found
+    def advance(self, steps: int) -> bool:
+        """Run `steps` steps, with a stop wherever fibers are due to be poured."""
+        target = self.step_count + steps
+        while (step := self.step_count) < target:
+            self.bed.pour_due(step)
+            if not super().advance(min(target - step, self.bed.pour.steps_left(step))):
+                return False
+        return True
 
-    def _move_as_told(self, nodes: np.ndarray) -> None:
-        """Give nodes that are held from now on the velocity that they are held at."""
-        if len(nodes) == 0:
-            return
-        told = self.holds.load.numpy()
-        motions = (self.state.node_velocity, self.node_spin, self.node_rate, self.node_spin_rate)
-        for array in motions:
-            values = array.numpy()
-            values[nodes] = told[nodes] if array is self.state.node_velocity else 0.0
-            array.assign(values)
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """As of every method; nothing while fibers are poured, which is between steps."""
+        return {} if self.bed.pour.waits else super().time_passes(steps)
 
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which no condition but strain and time surely ends the stage."""
-        if stage.kind in PRESSING:
-            return self.press.steps_left(stage, self.step_count)
-        if stage.kind in GRIPPING:
-            return self.grips.steps_left(self._nodes())
-        if stage.end_speed is None:
-            return None
-        return max(0, self.still_needed - int(self.still_steps.numpy().min()))
+        return self.bed.steps_left(stage)
 
     def stage_result(self, stage: Stage) -> dict[str, float]:
         """Yield stress of a bed that is pulled or sheared."""
@@ -301,13 +296,7 @@ class BondedSpheres(Method):
 
     def unmet(self, stage: Stage) -> str:
         """What the stage still waits for."""
-        if stage.kind in PRESSING:
-            return self.press.unmet(stage)
-        if stage.end_speed is None:
-            return ""
-        velocity = self.state.node_velocity.numpy().astype(float)
-        fastest = float(np.linalg.norm(velocity, axis=1).max()) * self.model.units.velocity
-        return f"end_speed = {stage.end_speed:g} m/s; the fastest node moves at {fastest:.4g} m/s"
+        return self.bed.unmet(stage)
 
     # -- what is saved and told -------------------------------------------------------------------
 
@@ -318,7 +307,7 @@ class BondedSpheres(Method):
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
-        arrays |= self.press.saved() | self.grips.saved() | self.energies.saved()
+        arrays |= self.bed.saved() | self.energies.saved()
         if self.native is not None:
             arrays |= self.native.near.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
@@ -327,8 +316,7 @@ class BondedSpheres(Method):
         """Take over what `saved` returned."""
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"bonds_{name}"])
-        self.press.restore(arrays)
-        self.grips.restore(arrays)
+        self.bed.restore(arrays)
         self.energies.restore(arrays)
         self.started = True
         if self.contacts is not None:

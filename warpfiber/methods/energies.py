@@ -146,7 +146,7 @@ class Energies:
             spheres.node_spin,
         ]
         kernel = self._bond_kernel()
-        found = measure_bond_energies(kernel, model.fiber_count, inputs, model.device)
+        found = measure_bond_energies(kernel, spheres.counted_fibers, inputs, model.device)
         lost = dict(zip(LOST, np.sum(self.lost.numpy(), axis=0).tolist(), strict=True))
         stored, rubbed = np.zeros(2), np.zeros(2)
         if spheres.contacts is not None:

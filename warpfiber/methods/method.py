@@ -162,6 +162,11 @@ class Method(ABC):
         return int(self.state.step.numpy()[0])
 
     @property
+    def counted_fibers(self) -> int:
+        """Fibers that are simulated now; measurements leave the later ones out."""
+        return self.model.fiber_count
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units."""
         return 0.0

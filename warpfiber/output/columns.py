@@ -24,7 +24,7 @@ _MEANINGS: dict[str, tuple[str, str]] = {
     "z_low": ("m", "lower plane of the layer above the floor of the box"),
     "z_high": ("m", "upper plane of the layer above the floor of the box"),
     "length": ("m", "centerline of all pieces cut at the planes of the layer"),
-    "volume_fraction": ("", "volume of the pieces over that of the layer"),
+    "volume_fraction": ("", "volume of fibers in the layer, or between the walls, over its volume"),
     "fibers": ("", "fibers with their middle in the layer"),
     "number_average_length": ("m", "L of the fibers with their middle in the layer, mean"),
     "weight_average_length": ("m", "L of these fibers weighted by L"),

@@ -1,7 +1,8 @@
 """C++ text that brings numbers of many places in arrays into lanes, and back (`native_capsules`).
 
 A row has the numbers of one place as they lie in memory; vectors have one number of all lanes. Rows
-are transposed by eight in registers.
+are transposed by eight in registers. Also the closest points of segments, in the order of
+operations of `segment_distance`.
 """
 
 from warpfiber.passes.native import transpose
@@ -78,6 +79,30 @@ _ROWS = """
             delta.y += L[1][0] * n0 + L[1][1] * n1 + L[1][2] * n2;
             delta.z += L[2][0] * n0 + L[2][1] * n1 + L[2][2] * n2;
         }
+    };
+"""
+
+
+# Edges, distance vector and closest points of the pairs `ks`, from segments that begin at nodes.
+DISTANCE = """
+    auto closest = [&](const int* ks, const int* node_i, const int* node_j, V& s, V& t) -> V3 {
+        P4 rows_a[W], rows_b[W], rows_d[W];
+        for (int l = 0; l < W; ++l) {
+            const P4 xi = place_row(node_i[l]), xj = place_row(node_j[l]);
+            rows_a[l] = place_row(node_i[l] + 1) - xi;
+            rows_b[l] = place_row(node_j[l] + 1) - xj;
+            rows_d[l] = xj - xi;
+        }
+        const V3 a = turn(rows_a), b = turn(rows_b);
+        V3 delta = turn(rows_d);
+        add_images(ks, delta);
+        const V aa = larger(a.dot(a), V(TINY)), bb = larger(b.dot(b), V(TINY));
+        const V ab = a.dot(b), da = delta.dot(a), db = delta.dot(b);
+        const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
+        s = clamp01((da * bb - db * ab) / den);
+        t = clamp01((s * ab - db) / bb);
+        s = clamp01((t * ab + da) / aa);
+        return delta + b * t - a * s;
     };
 """
 

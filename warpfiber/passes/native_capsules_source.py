@@ -11,7 +11,7 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
-from warpfiber.passes.native_capsule_rows import image_constants, row_source
+from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_source
 
 # Pairs in both precisions: two registers of eight numbers hide each other's latency.
 LANES = 16
@@ -19,7 +19,7 @@ PARTS = 2  # of the list; as many workers share a sweep
 LINE = 8  # numbers per node and part: force, moment, two unused
 
 
-def _constants(name: str, features: CapsuleFeatures) -> str:
+def capsule_constants(name: str, features: CapsuleFeatures) -> str:
     """Features and numbers that are fixed when the sweep is compiled."""
     flags = {
         "IS_PERIODIC": features.periodic,
@@ -261,29 +261,6 @@ _LAW = """
     };
 """
 
-# Edges, distance vector and closest points of the pairs `ks`, from segments that begin at nodes.
-_DISTANCE = """
-    auto closest = [&](const int* ks, const int* node_i, const int* node_j, V& s, V& t) -> V3 {
-        P4 rows_a[W], rows_b[W], rows_d[W];
-        for (int l = 0; l < W; ++l) {
-            const P4 xi = place_row(node_i[l]), xj = place_row(node_j[l]);
-            rows_a[l] = place_row(node_i[l] + 1) - xi;
-            rows_b[l] = place_row(node_j[l] + 1) - xj;
-            rows_d[l] = xj - xi;
-        }
-        const V3 a = turn(rows_a), b = turn(rows_b);
-        V3 delta = turn(rows_d);
-        add_images(ks, delta);
-        const V aa = larger(a.dot(a), V(TINY)), bb = larger(b.dot(b), V(TINY));
-        const V ab = a.dot(b), da = delta.dot(a), db = delta.dot(b);
-        const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
-        s = clamp01((da * bb - db * ab) / den);
-        t = clamp01((s * ab - db) / bb);
-        s = clamp01((t * ab + da) / aa);
-        return delta + b * t - a * s;
-    };
-"""
-
 _SWEEP = """
     const int begin = out_start[part_start[part]], end = begin + near_count[part];
     constexpr int ROOM = 2 * W;
@@ -329,37 +306,6 @@ _SWEEP = """
     }
 """
 
-# Of the part's pairs those that are nearer than their reach and the skins of their segments.
-_NEAR = """
-    const int begin = out_start[part_start[part]], end = out_start[part_start[part + 1]];
-    int found = begin;
-    auto skin_of = [&](int node) -> T {
-        const T one = near_skin[node], other = near_skin[node + 1];
-        return one > other ? one : other;
-    };
-    for (int first = begin; first < end; first += W) {
-        const int count = end - first < W ? end - first : W;
-        int ks[W], from_i[W], from_j[W];
-        V reach;
-        for (int l = 0; l < W; ++l) {
-            const int k = ks[l] = first + (l < count ? l : count - 1);
-            from_i[l] = segment_node[pair_i[k]];
-            from_j[l] = segment_node[pair_j[k]];
-            ((T*)&reach)[l] = largest_reach + skin_of(from_i[l]) + skin_of(from_j[l]);
-        }
-        V s, t;
-        const V3 c = closest(ks, from_i, from_j, s, t);
-        const M near = c.dot(c) <= reach * reach;
-        for (int l = 0; l < count; ++l) {
-            near_pair[found] = ks[l];
-            near_i[found] = from_i[l];
-            near_j[found] = from_j[l];
-            found += near[l] ? 1 : 0;
-        }
-    }
-    near_count[part] = found - begin;
-"""
-
 
 def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
@@ -371,7 +317,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
-    {_constants(name, features)}
+    {capsule_constants(name, features)}
     {contact_constants(name)}
     if (status[SLOT_HALT] != 0) return;
     const V3 nothing3 = same3(0, 0, 0);
@@ -379,31 +325,9 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     {row_source()}
     {POWERS}
     {_HAND_OVER}
-    {_DISTANCE}
+    {DISTANCE}
     {law}
     {_SWEEP}
-    }};
-    sweep();
-    """
-
-
-def near_list_source(name: str, features: CapsuleFeatures, arrays: list[str]) -> str:
-    """Body of a function that makes a part of the list of near pairs."""
-    addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
-    return f"""
-    auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
-    #pragma clang fp contract(fast)
-    {lane_types(name, LANES)}
-    {_constants(name, features)}
-    constexpr T TINY = T(1e-30);
-    {row_source()}
-    auto larger = [](V x, V y) -> V {{ return x > y ? x : y; }};
-    auto clamp01 = [](V x) -> V {{
-        x = x > T(0) ? x : V(T(0));
-        return x < T(1) ? x : V(T(1));
-    }};
-    {_DISTANCE}
-    {_NEAR}
     }};
     sweep();
     """

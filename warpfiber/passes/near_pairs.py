@@ -18,7 +18,8 @@ import warp as wp
 
 from warpfiber.model import precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
-from warpfiber.passes.native_capsules_source import PARTS, near_list_source
+from warpfiber.passes.native_capsules_source import PARTS
+from warpfiber.passes.native_near_source import near_list_source
 
 # Measured, 500 fibers of 26 segments in a bed under a plate: flat around these.
 LEAST = 0.025  # skin of a node at rest, diameters
