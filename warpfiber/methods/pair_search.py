@@ -28,7 +28,8 @@ SPARE = 1.1
 class PairSearch:
     """Neighbor list and skin; lengths in run units.
 
-    `reach`: distance of center lines up to which pairs are listed beside the skin.
+    `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
+    of one more listed pair, see `skin.PAIR_COST`.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class PairSearch:
         native: bool | None = None,
         pair_cost: float = STEP_PAIR_COST,
     ) -> None:
+        self.pair_cost = pair_cost
         self.scene, self.model, self.state = scene, model, state
         self.pair_cost = pair_cost
         self.seconds = 0.0  # spent on builds
