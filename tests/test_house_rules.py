@@ -32,7 +32,7 @@ ROOMS = (
 RANK = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 # The public names of the package are loaded on first use from any room.
 FACADE = "__init__"
-LAZY = {"h5py", "pxr", "matplotlib", "mpl_toolkits", "tqdm"}
+LAZY = {"h5py", "pxr", "matplotlib", "mpl_toolkits", "tqdm", "scipy", "fiberoripy"}
 LAZY_ROOMS = {"output", "progress"}
 FOREIGN = {"tests", "tools", "scenes"}
 KERNEL_ROOM = "passes"  # the only one with `@wp.kernel` and `wp.launch`

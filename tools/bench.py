@@ -10,6 +10,7 @@
                                                   node-step (--load: seconds of a whole loading)
     python tools/bench.py contact [PART ...]      implicit contact: overlaps, A_xx, time over that
                                                   of explicit steps (parts: see bench_contact.py)
+    python tools/bench.py plate [PART ...]        the sliding-plate cell: error of A against time
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
     --workers W, --repeats N, --method M, --dry (print, do not write)
 
@@ -31,6 +32,7 @@ from bench_contact import contact_rows
 from bench_dem import dem_rows
 from bench_overdamped import overdamped_rows
 from bench_papers import period_rows, suspension_rows
+from bench_plate import plate_rows
 from machine import ROOT, SCENES, commit, processor
 
 import warpfiber as wf
@@ -267,10 +269,15 @@ def dem(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     yield from dem_rows(args, common)
 
 
+def plate(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The sliding-plate cell (`bench_plate`)."""
+    yield from plate_rows(args, common)
+
+
 def main() -> None:
     """Run one benchmark and append its rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact", "dem"]
+    benches = ["engine", "beads", "accuracy", "period", "suspensions", "contact", "dem", "plate"]
     parser.add_argument("bench", choices=benches)
     parser.add_argument("names", nargs="*", help="cells of `suspensions`, parts of `contact`")
     parser.add_argument("--method", default="bead_chain", help="of `period`, `suspensions`")
@@ -284,6 +291,7 @@ def main() -> None:
     parser.add_argument("--cell-fibers", type=int, default=1000, help="of `contact`")
     parser.add_argument("--explicit", type=float, default=2.0, help="strain, of `contact`")
     parser.add_argument("--fraction", type=float, default=0.29, help="where `dem` starts")
+    parser.add_argument("--volume", type=float, default=1.0, help="part of the fibers, of `plate`")
     parser.add_argument("--steps", type=int, default=400, help="of one repeat of `dem`")
     parser.add_argument("--load", action="store_true", help="`dem`: the whole loading")
     parser.add_argument("--device", default="cpu")

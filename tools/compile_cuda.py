@@ -243,7 +243,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "capsule_pairs", "plain", make_capsule_pairs(precision, CapsuleFeatures())
     rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
     yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
-    yield "carry_memory", "", make_carry_memory(precision)
+    yield "carry_memory", "", make_carry_memory(precision, True)
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
@@ -278,12 +278,13 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         for make in (make_cell_kernels, make_row_kernels):
             for name, kernel in make(precision, list_features).items():
                 yield name, variant, kernel
-    for variant, walls, lubrication in (
-        ("sheared", (False, False, False), "none"),
-        ("wall paper", (False, False, True), "paper"),
+    for variant, walls, lubrication, arrays in (
+        ("sheared", (False, False, False), "none", False),
+        ("wall paper", (False, False, True), "paper", False),
+        ("array", (False, False, True), "none", True),
     ):
-        features = RowFeatures(True, walls, lubrication)
-        checks = make_check_sweeps(precision, CheckFeatures(True, walls))
+        features = RowFeatures(True, walls, lubrication, arrays)
+        checks = make_check_sweeps(precision, CheckFeatures(True, walls, arrays=arrays))
         for name, kernel in (make_row_count(precision, features) | checks).items():
             yield name, variant, kernel
         yield "fill_rows", variant, make_row_fill(precision, features)

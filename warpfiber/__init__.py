@@ -8,7 +8,14 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from warpfiber.job import Job
-    from warpfiber.output import TrajectoryReader, export_usd, plot_run, read_scalars
+    from warpfiber.output import (
+        TrajectoryReader,
+        exact_orientation,
+        export_usd,
+        fit_run,
+        plot_run,
+        read_scalars,
+    )
     from warpfiber.scene import Scene, SceneError, load_scene
     from warpfiber.simulation import Diverged, Simulation
 
@@ -25,6 +32,8 @@ _ROOMS = {
     "read_scalars": "warpfiber.output",
     "plot_run": "warpfiber.output",
     "export_usd": "warpfiber.output",
+    "fit_run": "warpfiber.output",
+    "exact_orientation": "warpfiber.output",
 }
 
 __all__ = [
@@ -34,7 +43,9 @@ __all__ = [
     "SceneError",
     "Simulation",
     "TrajectoryReader",
+    "exact_orientation",
     "export_usd",
+    "fit_run",
     "load_scene",
     "plot_run",
     "read_scalars",

@@ -1,4 +1,4 @@
-"""The command line: run, resume, check, info, plot, export.
+"""The command line: run, resume, check, info, plot, export, fit.
 
 Exit codes: 0 finished; 2 a fault found before the first step; 3 diverged or a stage that missed its
 condition; 4 a file error later; 130 Ctrl-C and 143 SIGTERM or wall limit, both with a checkpoint.
@@ -52,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     plot = add("plot", "Draw the figures of one run, or of several in the same axes.")
     plot.add_argument("folders", nargs="+", help="result folders")
     plot.add_argument("--out", metavar="DIR", help="folder of the pictures")
+    plot.add_argument("--exact", action="store_true", help="with the orientation without contact")
     export = add("export", "Write a run in another format.")
     export.add_argument("format", choices=["usd"])
     export.add_argument("result", help="result folder or its run.vtkhdf")
@@ -60,6 +61,19 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--wrap", choices=["none", "fiber", "split"], default="fiber")
     export.add_argument("--smooth", action="store_true", help="cubic curves through the nodes")
     export.add_argument("--color", choices=["orientation", "group"], default="orientation")
+    fit = add("fit", "Fit orientation models to a run; write constants and a figure into it.")
+    fit.add_argument("result", help="result folder or its run.vtkhdf")
+    fit.add_argument(
+        "--model",
+        action="append",
+        metavar="MODEL",
+        help="folgar_tucker, rsc, iard (these by default), pard, mrd; may be repeated",
+    )
+    fit.add_argument("--closure", default="IBOF", help="as in fiberoripy (default IBOF), or NONE")
+    fit.add_argument("--weighting", default="length", help="length (default) or number")
+    fit.add_argument("--from", type=float, dest="low", metavar="S", help="first strain")
+    fit.add_argument("--to", type=float, dest="high", metavar="S", help="last strain")
+    fit.add_argument("--noise", type=_seconds, default=0.005, help="of a component, for chi2")
     return parser
 
 
@@ -170,7 +184,7 @@ def _info(args: argparse.Namespace) -> int:
 def _plot(args: argparse.Namespace) -> int:
     from warpfiber.output import plot_run
 
-    for path in plot_run(list(args.folders), args.out):
+    for path in plot_run(list(args.folders), args.out, args.exact):
         print(path)
     return 0
 
@@ -191,6 +205,19 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
+def _fit(args: argparse.Namespace) -> int:
+    from warpfiber.output import fit_run
+
+    options = {"closure": args.closure, "weighting": args.weighting, "noise": args.noise}
+    if args.model:
+        options["models"] = args.model
+    report = fit_run(args.result, low=args.low, high=args.high, **options)
+    print("\n".join(report.lines()))
+    for path in report.files:
+        print(path)
+    return 0
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     args = _parser().parse_args(argv)
@@ -201,6 +228,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "info": _info,
         "plot": _plot,
         "export": _export,
+        "fit": _fit,
     }
     try:
         return commands[args.command](args)
@@ -214,9 +242,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"warpfiber: {fault}", file=sys.stderr)
         return 4
     except ImportError as missing:
-        if missing.name not in ("matplotlib", "tqdm", "pxr"):
+        extras = {"matplotlib": "plot", "tqdm": "plot", "pxr": "plot"}
+        extras |= {"fiberoripy": "fit", "scipy": "fit"}
+        if missing.name not in extras:
             raise
-        remedy = "install warpfiber with the extra 'plot'"
+        remedy = f"install warpfiber with the extra '{extras[missing.name]}'"
         gap = Fault("command line", args.command, str(missing.name), f"not installed; {remedy}")
         print(f"warpfiber: {gap}", file=sys.stderr)
         return 2

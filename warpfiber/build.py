@@ -27,6 +27,7 @@ from warpfiber.model import (
 from warpfiber.passes.precision import group_struct
 from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.arrays import wall_arrays
 from warpfiber.scene.derived import INERTIALESS
 
 
@@ -98,7 +99,8 @@ def _domain(scene: Scene, placement: Placement, units: Units) -> Domain:
         entries = np.argwhere(np.asarray(flow.velocity_gradient) != 0.0)
         if len(entries) == 1 and entries[0][0] != entries[0][1]:
             shear_axes = (int(entries[0][0]), int(entries[0][1]))
-    return Domain((0.0, 0.0, 0.0), edges, periodic, wall, moving, shear_axes)  # type: ignore[arg-type]
+    arrays = tuple((w / units.length, r / units.length) for w, r in wall_arrays(scene))
+    return Domain((0.0, 0.0, 0.0), edges, periodic, wall, moving, shear_axes, arrays)  # type: ignore[arg-type]
 
 
 def device_groups(rows: list[dict[str, Any]], p: Precision, device: str) -> tuple[Any, Any]:

@@ -120,6 +120,9 @@ class Domain:
     # (i, j) if the flow is du_i/dx_j alone: the lattice can be reset to less than half a box of
     # shear
     shear_axes: tuple[int, int] | None = None
+    # of the walls x-, x+, y- ... (spacing, radius) of an array of fibers, (0, 0) for a plane;
+    # empty where all are planes
+    arrays: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass

@@ -63,6 +63,7 @@ class Recording:
                 scene_json=json.dumps(scene.as_dict()),
                 attrs=attrs,
                 node_fields=[f"node_{name}" for name in scene.record.node_fields],
+                layer_columns=layers.columns[len(MOMENT) + 1 :] if layers is not None else (),
             )
         return cls(scene, simulation, scalars, layers, trajectory, {}, -1)
 
@@ -127,11 +128,12 @@ class Recording:
         if self.trajectory is None:
             return
         row = self.last_row if self.row_step == self.frame_step else simulation.measure()
-        fields = {}
+        fields = simulation.method.node_fields()
         if "velocity" in self.scene.record.node_fields:
             fields["node_velocity"] = simulation.node_velocity
         values: dict[str, Any] = {k: v for k, v in row.items() if k not in MOMENT}
-        values |= {f"layer_{name}": column for name, column in layers.items()}
+        if layers:
+            values["layers"] = np.stack(list(layers.values()), axis=1)
         self.trajectory.append(
             simulation.step_count,
             simulation.time,

@@ -336,6 +336,7 @@ class Simulation:
     def measure(self) -> dict[str, float]:
         """Step, time (s), strain, and what `record.quantities` asks for, in SI."""
         self.prepare()
+        self.measurement.counted = self.method.counted_fibers
         row = {"step": self.step_count, "time": self.time, "strain": self.strain}
         return row | self.measurement.row(self.method.list) | self.method.measure()
 

@@ -176,3 +176,23 @@ def test_a_contact_that_begins_again_has_no_memory() -> None:
     sim.step(500)
     assert contacts.acts.numpy().sum() == 0
     assert contacts.written.numpy()[1].max() < 505
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.5])
+@pytest.mark.parametrize(("clamp", "expected"), [(True, 0.717824), (False, 0.699571)])
+def test_restitution_of_the_law(clamp: bool, expected: float, speed: float) -> None:
+    """Head on: e = 0.6996 for a dashpot that may pull, 0.7178 for one that may not."""
+    rods = rod([0.0, 0.0, 0.0], [1, 0, 0], 1), rod([1.2e-3, -1.2e-3, 2.4e-3], [0, 1, 0], 1)
+    laws = Laws(damping=0.113, clamp=clamp)
+    x = np.concatenate([r.rest for r in rods])
+    mass = np.concatenate([r.mass for r in rods])[:, None]
+    v = np.zeros((4, 3))
+    v[:2, 2], v[2:, 2] = 0.5 * speed, -0.5 * speed
+    still, dt = np.zeros((4, 3)), 4e-6 * speed**-0.2
+    rate = still
+    while v[2, 2] < 0.0 or x[2, 2] - x[0, 2] < 2.0 * RADIUS + 1e-9:
+        v = v + 0.5 * dt * rate
+        x = x + dt * v
+        rate = contact_loads(laws, rods, x, v, still, dt)[0] / mass
+        v = v + 0.5 * dt * rate
+    assert (v[2, 2] - v[0, 2]) / speed == pytest.approx(expected, rel=1e-3)

@@ -6,6 +6,7 @@ box, which moves each cut by that part of a segment of a twentieth of the box: 1
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,7 @@ def test_layers_of_a_leaning_box_follow_its_third_vector() -> None:
 
 
 def test_files_hold_the_layers_of_every_frame(tmp_path: Path) -> None:
-    """`layers.csv` has a row per layer and frame, the trajectory the same numbers as arrays."""
+    """`layers.csv` has a row per layer and frame, the trajectory the same numbers as an array."""
     tables = changed({"record.layers": 4, "record.frames": 3, "stage.0.end_strain": 0.02})
     job = wf.Job.start(scene_from_dict(tables), out=tmp_path / "run")
     assert job.run() == 0
@@ -146,10 +147,14 @@ def test_files_hold_the_layers_of_every_frame(tmp_path: Path) -> None:
     assert list(table["layer"][:5]) == [0, 1, 2, 3, 0]
     final = job.simulation.measure_layers()
     with h5py.File(tmp_path / "run" / "run.vtkhdf") as file:
-        for name, column in final.items():
-            np.testing.assert_array_equal(table[name][-4:], column)
-            np.testing.assert_array_equal(file[f"warpfiber/layer_{name}"][-1], column)
-            assert file[f"warpfiber/layer_{name}"].attrs["meaning"] == column_meaning(name)[1]
+        columns = json.loads(file["warpfiber"].attrs["layer_columns"])
+        recorded = file["warpfiber/layers"][-1]
+        assert file["warpfiber/a11"].attrs["meaning"] == column_meaning("a11")[1]
+    assert list(columns) == list(final)
+    for k, (name, column) in enumerate(final.items()):
+        np.testing.assert_array_equal(table[name][-4:], column)
+        np.testing.assert_array_equal(recorded[:, k], column)
+        assert columns[name][1] == column_meaning(name)[1]
     assert column_meaning("a11")[1] != column_meaning("a11_fiber")[1]
     lines = (tmp_path / "run" / "columns.csv").read_text().splitlines()
     named = {tuple(line.split(",")[:2]) for line in lines[1:]}

@@ -287,6 +287,23 @@ def test_bad_layers(tables: dict[str, Any], key: str, remedy: str) -> None:
     assert any(remedy in fault.remedy for fault in faults)
 
 
+@pytest.mark.parametrize(
+    ("tensor", "remedy"),
+    [
+        ([0.5, 0.6, 0.1, 0, 0, 0], "it must be 1"),
+        ([0.5, 0.6, -0.1, 0, 0, 0], "eigenvalues must be >= 0"),
+        ([0.5, 0.5, 0.0, 0.6, 0, 0], "eigenvalues must be >= 0"),
+        ([0.5, 0.5], "2 entries instead of 6"),
+    ],
+)
+def test_impossible_tensor_of_a_layer(tensor: list[float], remedy: str) -> None:
+    tables = layered((3e-4, 0.02), (3e-4, 0.02))
+    tables["fibers"][0]["layers"][1]["orientation"] = tensor
+    faults = faults_of(tables)
+    assert [fault.key for fault in faults] == ["fibers.0.layers.1.orientation"]
+    assert remedy in faults[0].remedy
+
+
 def test_fiber_too_upright_for_its_layer() -> None:
     tables = layered((3e-4, 0.02), (3e-4, 0.02), mode="inside")
     for layer in tables["fibers"][0]["layers"]:

@@ -190,6 +190,42 @@ def test_bad_histogram(tmp_path: Path, text: str | None, remedy: str) -> None:
     assert remedy in faults[0].remedy
 
 
+@pytest.mark.parametrize(
+    ("rows", "remedy"),
+    [
+        ([[1e-3, 2e-3, 3], [2.5e-3, 3e-3, 1]], "a gap before bin 1"),
+        ([[1e-3, 2e-3, 3], [1.5e-3, 3e-3, 1]], "an overlap before bin 1"),
+        ([[1e-3, 2e-3, -3]], "has -3 fibers"),
+        ([[1e-3, 2e-3, 0]], "all its counts are 0"),
+        ([[1e-3, 5e-3, 1]], "the periodic box is"),
+        ([[1e-3, 2e-3]], "2 entries instead of 3"),
+        ([], "0 entries"),
+        ("h.txt", "unknown file type"),
+    ],
+)
+def test_bad_bins_in_the_scene(rows: Any, remedy: str) -> None:
+    faults = faults_of(plate_cell(fibers__0__length_distribution={"histogram": rows}))
+    assert [fault.key for fault in faults] == ["fibers.0.length_distribution.histogram"]
+    assert remedy in faults[0].remedy
+
+
+def test_bins_in_the_scene_are_those_of_a_file(tmp_path: Path) -> None:
+    """Kunc's correction in both: a third of the column's diameter and more for long fibers."""
+    rows = [[0.0, 1e-3, 8.0], [1e-3, 2e-3, 3.0], [2e-3, 4e-3, 1.0]]
+    lines = [",".join(map(str, row)) for row in rows]
+    (tmp_path / "h.csv").write_text("\n".join(["lower,upper,count", *lines]))
+
+    def lengths(histogram: Any, **keys: float) -> list[float]:
+        table = {"histogram": histogram} | keys
+        scene = scene_from_dict(plate_cell(fibers__0__length_distribution=table))
+        assert scene_from_dict(scene.as_dict()) == scene
+        return [length for g in split_tables(scene).fibers for length in [g.length] * g.count]
+
+    inline = lengths(rows, kunc_diameter=5e-3)
+    assert inline == lengths(str(tmp_path / "h.csv"), kunc_diameter=5e-3)
+    assert averages(np.array(inline))[0] < averages(np.array(lengths(rows)))[0]
+
+
 def test_histogram_file(tmp_path: Path) -> None:
     (tmp_path / "h.csv").write_text("lower,upper,count\n0,1e-3,8\n1e-3,2e-3,3\n2e-3,4e-3,1\n")
     tables = plate_cell(fibers__0__length_distribution={"histogram": str(tmp_path / "h.csv")})

@@ -223,14 +223,17 @@ def test_halted_step_changes_nothing(start: Start) -> None:
     assert not got.shift.any()
 
 
-def test_warm_start_of_the_solution(start: Start) -> None:
-    """Solved forces are accepted as they are; a repeated solve starts from them."""
+def test_warm_start_of_the_solution(start: Start, solver: str) -> None:
+    """A repeated solve starts from the forces found; passes over all rows accept them as is."""
     rods = Rods(start)
     cold = rods.solve()
     warm = rods.solve(repeats=2)
-    assert warm.updates == 0
-    assert (warm.force == cold.force).all()
-    assert (warm.shift == cold.shift).all()
+    assert warm.updates <= 1
+    if solver == "gradients":
+        assert warm.updates == 0
+        assert (warm.force == cold.force).all()
+        assert (warm.shift == cold.shift).all()
+    same_displacement(warm, rods, cold.force)
 
 
 @pytest.mark.parametrize("solver", ["gradients"], indirect=True)

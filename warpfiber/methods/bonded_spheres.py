@@ -11,40 +11,40 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.bed_measures import NODE_FIELDS, contact_forces, inclination_row
+from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
-    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
     pair_launch,
 )
 from warpfiber.methods.energies import Energies
-from warpfiber.methods.grips import Grips
 from warpfiber.methods.method import Method
-from warpfiber.methods.press import Press
+from warpfiber.methods.native_bonds import NativeBonds
+from warpfiber.methods.pair_search import STEP_PAIR_COST
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
 from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.gripping import GRIPPING
-from warpfiber.scene.pressing import PRESSING
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
-STILL_TIME = 0.01  # s for which all nodes must be slower than `end_speed`
 
 # Arrays that the next step depends on beside the State.
 _CARRIED = (
@@ -64,9 +64,8 @@ class BondedSpheres(Method):
         super().__init__(scene, model, state, dt, workers)
         p, device, nodes = model.precision, model.device, model.node_count
         self.started = False
-        self.press = Press(scene, model, state, self.dt)
-        self.grips = Grips(scene, model, state, self.dt)
-        self.holds = self.grips.holds
+        self.bed = BedStages(self)
+        self.press, self.grips, self.holds = self.bed.press, self.bed.grips, self.bed.holds
         self.features = BondFeatures(
             dashpots=any(group.bond_damping > 0.0 for group in scene.fibers),
             walls=model.domain.wall,
@@ -95,19 +94,21 @@ class BondedSpheres(Method):
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
         self.wall_depth = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
-        self.still_needed = math.ceil(STILL_TIME / (self.dt * model.units.time))
         # float64 in every precision: world positions in float32 lose slow motion
         self.place = state.node_pos
         if p.name == "float32":
             self.place = wp.zeros(nodes, dtype=wp.vec3d, device=device)
+        vectors = NATIVE and native_bonds_apply(model, self.features)
         self.contacts: BondedContacts | None = None
         if self.features.pairs:
             stretch = float(self._segment_stretch().max())
-            self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
+            self.contacts = BondedContacts(
+                scene, model, state, self.workers, stretch, PAIR_COST if vectors else STEP_PAIR_COST
+            )
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
         self.native: NativeBonds | None = None
-        if NATIVE and native_bonds_apply(model, self.features):
+        if vectors:
             self.native = NativeBonds(self)
         self.energies = Energies(self)
 
@@ -167,6 +168,11 @@ class BondedSpheres(Method):
         ]
 
     @property
+    def counted_fibers(self) -> int:
+        """Those that are poured; at least one, so that there is something to measure."""
+        return max(1, self.bed.pour.count)
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units; with the start skin."""
         return self.contacts.search.box_width if self.contacts is not None else 0.0
@@ -186,10 +192,13 @@ class BondedSpheres(Method):
             self.place.assign(self.state.node_pos.numpy().astype(float))
         first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
-            if self.contacts.build(self.step_count):
+            replaced = self.contacts.build(self.step_count)
+            self._find_near()
+            if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), self._rates()]
+            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
+            first = [pairs(0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
@@ -197,7 +206,7 @@ class BondedSpheres(Method):
     def _prepare_steps(self, kernels: list[Any]) -> None:
         if self.executor is None and self.native is not None:
             load_kernels([*self.native.kernels(), *kernels], self.model.device)
-            self.executor = self.native.steps(self._halted)
+            self.executor = self.native.steps()
         super().prepare(kernels)
 
     def _rates(self) -> Launch:
@@ -211,15 +220,36 @@ class BondedSpheres(Method):
         status = self._status()
         if status[TORN]:
             return False
+        if status[EXPIRED] and self.native is not None and self.native.near.lasts():
+            self.native.near.find()
+            status[EXPIRED] = 0
         if status[EXPIRED] and self.contacts is not None:
             replaced = self.contacts.expire(self.step_count)
-            if replaced is None:
+            if replaced is None or not self._find_near():
                 remedy = "fibers move farther in one step than any skin; give a smaller dt"
                 raise SceneError([Fault(self.scene.path, "numerics.dt", None, remedy)])
             if replaced:
                 self._stop_executor()
             self.list_seconds = self.contacts.search.seconds
         return True
+
+    def _find_near(self) -> bool:
+        """Near pairs of a new list; False if they do not last a step."""
+        if self.native is None:
+            return True
+        near = self.native.near
+        lasting = near.lasts() or near.lasts_a_step()
+        near.find()
+        return lasting
+
+    def rebuild_list(self) -> None:
+        """List the pairs of the present positions: some node was set elsewhere."""
+        if self.contacts is None:
+            return
+        replaced = self.contacts.build(self.step_count)
+        self._find_near()
+        if replaced:
+            self._stop_executor()
 
     def list_report(self) -> dict[str, float]:
         """What the search for pairs did; nothing without a list."""
@@ -230,47 +260,36 @@ class BondedSpheres(Method):
         super().close()
         if self.contacts is not None:
             self.contacts.search.close()
+        if self.native is not None:
+            self.native.near.close()
+
+    # -- stages -----------------------------------------------------------------------------------
 
     def begin_stage(self, stage: Stage, *, resumed: bool = False) -> None:
-        """Take over the damping of a stage; count anew how long all nodes have been still."""
+        """Take over the damping of a stage and what it does to the bed."""
         units = self.model.units
         numbers = np.zeros(STAGE_SIZE, dtype=self.model.precision.numpy)
         numbers[SETTLING] = stage.damping * units.time
         numbers[END_SPEED] = ((stage.end_speed or 0.0) / units.velocity) ** 2
         self.stage.assign(numbers)
-        nodes = self._nodes()
-        gripped = self.grips.begin(stage, nodes, resumed=resumed)
-        if not resumed:
-            self.still_steps.zero_()
-            self.press.begin(stage, nodes)
-            self._move_as_told(gripped)
+        self.bed.begin_stage(stage, resumed=resumed)
 
-    def _nodes(self) -> np.ndarray:
-        """(N, 3) positions now, run units, as exact as they are kept."""
-        nodes = self.place if self.started else self.state.node_pos
-        found: np.ndarray = nodes.numpy().astype(float)
-        return found
+    def advance(self, steps: int) -> bool:
+        """Run `steps` steps, with a stop wherever fibers are due to be poured."""
+        target = self.step_count + steps
+        while (step := self.step_count) < target:
+            self.bed.pour_due(step)
+            if not super().advance(min(target - step, self.bed.pour.steps_left(step))):
+                return False
+        return True
 
-    def _move_as_told(self, nodes: np.ndarray) -> None:
-        """Give nodes that are held from now on the velocity that they are held at."""
-        if len(nodes) == 0:
-            return
-        told = self.holds.load.numpy()
-        motions = (self.state.node_velocity, self.node_spin, self.node_rate, self.node_spin_rate)
-        for array in motions:
-            values = array.numpy()
-            values[nodes] = told[nodes] if array is self.state.node_velocity else 0.0
-            array.assign(values)
+    def time_passes(self, steps: int) -> dict[str, float]:
+        """As of every method; nothing while fibers are poured, which is between steps."""
+        return {} if self.bed.pour.waits else super().time_passes(steps)
 
     def steps_left(self, stage: Stage) -> int | None:
         """Steps before which no condition but strain and time surely ends the stage."""
-        if stage.kind in PRESSING:
-            return self.press.steps_left(stage, self.step_count)
-        if stage.kind in GRIPPING:
-            return self.grips.steps_left(self._nodes())
-        if stage.end_speed is None:
-            return None
-        return max(0, self.still_needed - int(self.still_steps.numpy().min()))
+        return self.bed.steps_left(stage)
 
     def stage_result(self, stage: Stage) -> dict[str, float]:
         """Yield stress of a bed that is pulled or sheared."""
@@ -278,36 +297,41 @@ class BondedSpheres(Method):
 
     def unmet(self, stage: Stage) -> str:
         """What the stage still waits for."""
-        if stage.kind in PRESSING:
-            return self.press.unmet(stage)
-        if stage.end_speed is None:
-            return ""
-        velocity = self.state.node_velocity.numpy().astype(float)
-        fastest = float(np.linalg.norm(velocity, axis=1).max()) * self.model.units.velocity
-        return f"end_speed = {stage.end_speed:g} m/s; the fastest node moves at {fastest:.4g} m/s"
+        return self.bed.unmet(stage)
 
     # -- what is saved and told -------------------------------------------------------------------
 
     def measure(self) -> dict[str, float]:
         """Energies in J and what walls feel, where `record.quantities` asks for them."""
-        return self.press.measure() | self.grips.measure() | self.energies.measure()
+        row = self.press.measure() | self.grips.measure() | self.energies.measure()
+        wanted = self.scene.record.quantities
+        row |= contact_forces(self) if "contacts" in wanted else {}
+        return row | (inclination_row(self) if "inclination" in wanted else {})
+
+    def node_fields(self) -> dict[str, np.ndarray]:
+        """Those of `record.node_fields` that this method knows."""
+        wanted = [name for name in NODE_FIELDS if name in self.scene.record.node_fields]
+        return {f"node_{name}": NODE_FIELDS[name](self) for name in wanted}
 
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
-        arrays |= self.press.saved() | self.grips.saved() | self.energies.saved()
+        arrays |= self.bed.saved() | self.energies.saved()
+        if self.native is not None:
+            arrays |= self.native.near.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"bonds_{name}"])
-        self.press.restore(arrays)
-        self.grips.restore(arrays)
+        self.bed.restore(arrays)
         self.energies.restore(arrays)
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
+            if self.native is not None:
+                self.native.near.restore(arrays)
             self._stop_executor()
 
     def torn_fiber(self) -> dict[str, Any]:

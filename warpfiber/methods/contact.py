@@ -168,6 +168,7 @@ class ImplicitContact:
             lattice_back=step.ends_lattice[0:1],
             lattice_now=step.ends_lattice[1:2],
             fiber_frozen=fiber_frozen,
+            solves=self.solves,
         )
         self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)

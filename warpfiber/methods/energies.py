@@ -146,7 +146,7 @@ class Energies:
             spheres.node_spin,
         ]
         kernel = self._bond_kernel()
-        found = measure_bond_energies(kernel, model.fiber_count, inputs, model.device)
+        found = measure_bond_energies(kernel, spheres.counted_fibers, inputs, model.device)
         lost = dict(zip(LOST, np.sum(self.lost.numpy(), axis=0).tolist(), strict=True))
         stored, rubbed = np.zeros(2), np.zeros(2)
         if spheres.contacts is not None:
@@ -177,7 +177,6 @@ class Energies:
             "dissipated_bonds": features.dashpots,
             "dissipated_contacts": spheres.scene.contact.damping > 0.0,
             "dissipated_friction": rubs,
-            "dissipated_settling": any(stage.damping > 0.0 for stage in spheres.scene.stages),
         }
         unit = model.units.energy
         return {name: value * unit for name, value in row.items() if present.get(name, True)}

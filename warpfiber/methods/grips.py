@@ -51,10 +51,12 @@ _CARRIED = ("grip", "mean", "course")
 class Grips:
     """Both grips; without a stage that needs them nothing is allocated or launched."""
 
-    def __init__(self, scene: Scene, model: Model, state: State, dt: float) -> None:
+    def __init__(
+        self, scene: Scene, model: Model, state: State, dt: float, holds: NodeHolds
+    ) -> None:
         self.scene, self.model, self.state, self.dt = scene, model, state, dt
         self.used = grips(scene)
-        self.holds = NodeHolds(scene, model, grips=self.used)
+        self.holds = holds
         p, device = model.precision, model.device
         self.stage: Stage | None = None  # the one under way, if it grips
         nodes = model.node_count if self.used else 0
@@ -98,8 +100,6 @@ class Grips:
         self.stage = stage if stage.kind in GRIPPING else None
         if self.stage is None:
             self.task.assign(_task())
-            if not resumed:
-                self.holds.release()
             return gripped
         axis, speed = drawn_axis(stage), (stage.speed or 0.0) / units.velocity
         steps = (stage.end_time or 0.0) / units.time / self.dt
@@ -109,7 +109,7 @@ class Grips:
         hold = self._gripped(stage, nodes)
         velocity = np.zeros_like(nodes)
         velocity[hold == UPPER, axis] = speed
-        self.holds.grip(hold, velocity)
+        self.holds.take(hold, velocity)
         course = np.zeros(COURSE_SIZE)
         course[WORK] = self.course.numpy()[WORK]
         self.course.assign(course)
@@ -205,18 +205,17 @@ class Grips:
         }
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Holds, forces and the course of the stage."""
+        """Forces and the course of the stage."""
         if not self.used:
             return {}
         arrays = {f"grips_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
-        return arrays | self.holds.saved()
+        return arrays
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
         if self.used:
             for name in _CARRIED:
                 getattr(self, name).assign(arrays[f"grips_{name}"])
-            self.holds.restore(arrays)
 
 
 def _task(component: int = -1, steady_from: float = 0.0, speed: float = 0.0) -> np.ndarray:

@@ -162,6 +162,11 @@ class Method(ABC):
         return int(self.state.step.numpy()[0])
 
     @property
+    def counted_fibers(self) -> int:
+        """Fibers that are simulated now; measurements leave the later ones out."""
+        return self.model.fiber_count
+
+    @property
     def box_width(self) -> float:
         """Smallest height that a periodic box may have, run units."""
         return 0.0
@@ -196,6 +201,10 @@ class Method(ABC):
 
     def measure(self) -> dict[str, float]:
         """Columns of the record beside those that all methods have, SI."""
+        return {}
+
+    def node_fields(self) -> dict[str, np.ndarray]:
+        """Values by node of `record.node_fields` beside the velocity, SI."""
         return {}
 
     @abstractmethod

@@ -1,7 +1,8 @@
-"""Nodes of bonded spheres that move as told: held and frozen ones always, gripped ones for a stage.
+"""Nodes of bonded spheres that move as told: held and frozen ones always, others for a stage.
 
-A clamp of a [[load]] holds one node and its orientation: that is its segment's at this end. A
-gripped node keeps its orientation too. What a stage grips goes before what a load says.
+A clamp of a [[load]] holds one node and its orientation: that is its segment's at this end. Nodes
+that a stage holds, in grips or before they are poured, keep their orientation too; they do so
+whatever a load says.
 Symbols: hold of a node as in `passes.bonds`, load = force on a free node, velocity of the others.
 """
 
@@ -24,17 +25,17 @@ _CARRIED = ("hold", "load")
 class NodeHolds:
     """Arrays `hold` and `load` of all nodes; empty where nothing is ever held or loaded."""
 
-    def __init__(self, scene: Scene, model: Model, *, grips: bool) -> None:
+    def __init__(self, scene: Scene, model: Model, *, changing: bool) -> None:
         p, device = model.precision, model.device
         hold, load = _imposed(scene, model)
-        if grips and not len(hold):
+        if changing and not len(hold):
             hold, load = np.zeros(model.node_count, np.int32), np.zeros((model.node_count, 3))
         self.used = len(hold) > 0
-        self._own = hold, load.astype(p.numpy)  # without grips
+        self._own = hold, load.astype(p.numpy)  # of loads and frozen groups
         self.hold = wp.array(hold, dtype=wp.int32, device=device)
         self.load = wp.array(self._own[1], dtype=p.vec3, device=device)
 
-    def grip(self, hold: np.ndarray, velocity: np.ndarray) -> None:
+    def take(self, hold: np.ndarray, velocity: np.ndarray) -> None:
         """Hold the nodes that are not FREE in `hold` (N,) at `velocity` (N, 3; run units)."""
         mine, load = self._own[0].copy(), self._own[1].copy()
         taken = hold != FREE
@@ -49,11 +50,15 @@ class NodeHolds:
 
     def saved(self) -> dict[str, np.ndarray]:
         """The present holds."""
-        return {f"node_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        return (
+            {}
+            if not self.used
+            else {f"node_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        )
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
-        for name in _CARRIED:
+        for name in _CARRIED if self.used else ():
             getattr(self, name).assign(arrays[f"node_{name}"])
 
 

@@ -28,7 +28,8 @@ SPARE = 1.1
 class PairSearch:
     """Neighbor list and skin; lengths in run units.
 
-    `reach`: distance of center lines up to which pairs are listed beside the skin.
+    `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
+    of one more listed pair, see `skin.PAIR_COST`.
     """
 
     def __init__(
@@ -41,8 +42,11 @@ class PairSearch:
         stretch: float,
         workers: int,
         native: bool | None = None,
+        pair_cost: float = STEP_PAIR_COST,
     ) -> None:
+        self.pair_cost = pair_cost
         self.scene, self.model, self.state = scene, model, state
+        self.pair_cost = pair_cost
         self.seconds = 0.0  # spent on builds
         self.radius = max(row["radius"] for row in model.group_rows)
         skin = START_SKIN * 2.0 * self.radius
@@ -77,7 +81,7 @@ class PairSearch:
             core=2.0 * min(row["radius"] for row in rows),
             length=float(np.average([row["rest"] for row in rows], weights=segments)),
             pieces_per_segment=pairs.piece_count / self.model.segment_count,
-            pair_cost=STEP_PAIR_COST,
+            pair_cost=self.pair_cost,
             fixed=self.scene.numerics.skin is not None,
         )
 

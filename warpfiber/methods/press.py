@@ -35,9 +35,11 @@ from warpfiber.passes.wall_servo import (
 from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.gripping import GRIPPING, HEIGHT
+from warpfiber.scene.pouring import UP
 from warpfiber.scene.pressing import PRESSING, pressed_axis, wall_side
 
 LOOK = 16  # steps from one look at the pressure to the next
+AWAY = 2.0  # heights of the box that the top is out of the way of fibers that are poured
 LEAST_GAP = 0.5  # diameters of the thickest fiber
 
 _CARRIED = "place velocity push mean work servo".split()
@@ -49,6 +51,7 @@ class Press:
     def __init__(self, scene: Scene, model: Model, state: State, dt: float) -> None:
         self.scene, self.model, self.state, self.dt = scene, model, state, dt
         self.axis = pressed_axis(scene)
+        self.fibers = model.fiber_count  # of them, the first ones are in the box
         device = model.device
         low = np.asarray(model.domain.low)
         self.corners = np.array([low, low + np.asarray(model.domain.size)])
@@ -68,10 +71,9 @@ class Press:
             assert scene.box is not None
             rule = scene.box.volume_rule
             self.area = scene.box.volume / scene.box.size[self.axis]
-            self.solid = math.fsum(
-                group.count * fiber_volume(rule, group.diameter, group.length)
-                for group in scene.fibers
-            )
+            self.fiber_volumes = [
+                fiber_volume(rule, group.diameter, group.length) for group in scene.fibers
+            ]
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -103,6 +105,11 @@ class Press:
 
     def begin(self, stage: Stage, nodes: np.ndarray) -> None:
         """Let the stage's wall jump to the nodes (N, 3; run units) and give it its speed."""
+        if stage.kind == "pour" or self.place.numpy()[1, UP] > self.corners[1, UP]:
+            place = self.place.numpy()
+            away = AWAY * (self.corners[1, UP] - self.corners[0, UP])
+            place[1, UP] = self.corners[1, UP] + (away if stage.kind == "pour" else 0.0)
+            self._set_places(place)
         if self.axis < 0:
             return
         velocity, servo = np.zeros((1, 2)), _led()
@@ -160,9 +167,17 @@ class Press:
     def _set_places(self, place: np.ndarray) -> None:
         """Put the walls elsewhere; the mean distance starts anew."""
         self.place.assign(place)
-        mean = self.mean.numpy()
-        mean[0, 2] = self._gap()
-        self.mean.assign(mean)
+        if self.axis >= 0:
+            mean = self.mean.numpy()
+            mean[0, 2] = self._gap()
+            self.mean.assign(mean)
+
+    @property
+    def solid(self) -> float:
+        """Volume of the fibers, m^3."""
+        present = self.model.host["fiber_group"][: self.fibers]
+        counts = np.bincount(present, minlength=len(self.fiber_volumes)).tolist()
+        return math.fsum(n * volume for n, volume in zip(counts, self.fiber_volumes, strict=True))
 
     def steps_left(self, stage: Stage, step: int) -> int:
         """Steps before which no condition of a pressing stage surely ends it.
@@ -227,8 +242,9 @@ class Press:
         return pushes
 
     def _fraction(self) -> float:
-        """Volume fraction between the walls, of the mean distance."""
-        height = float(self.mean.numpy()[0, 2]) * self.model.units.length
+        """Volume fraction between the walls, of the mean distance, in the box at most."""
+        edge = self.corners[1, self.axis] - self.corners[0, self.axis]
+        height = min(float(self.mean.numpy()[0, 2]), float(edge)) * self.model.units.length
         return self.solid / (self.area * height)
 
     def measure(self) -> dict[str, float]:
@@ -247,16 +263,14 @@ class Press:
         return row
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Places, velocities, forces, means and work."""
-        if self.axis < 0:
-            return {}
-        return {f"press_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        """Places, velocities, forces, means and work; without meters the places alone."""
+        names = _CARRIED if self.axis >= 0 else _CARRIED[:1]
+        return {f"press_{name}": getattr(self, name).numpy().copy() for name in names}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `saved` returned."""
-        if self.axis >= 0:
-            for name in _CARRIED:
-                getattr(self, name).assign(arrays[f"press_{name}"])
+        for name in _CARRIED if self.axis >= 0 else _CARRIED[:1]:
+            getattr(self, name).assign(arrays[f"press_{name}"])
 
 
 def _led() -> np.ndarray:

@@ -3,11 +3,17 @@
 A step costs build(s) u / s + pair_cost pairs(s) at the skin s, if motion uses up u of it per step.
 Builds tell u and the number of pairs; how the number changes with s follows from the volume around
 a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
-(excluded volume of spherocylinders, Onsager 1949). One list, not two: by their measured parts (ns
-per segment-step, skins in diameters) an outer list of skin 1.5 (build 316, every 44 steps) and one
-of 0.35 filtered from it (distances 36, order 15, every 9 steps) would come to 33 with the sweeps,
-one list of 0.57 (build 225, every 15 steps) to 38: too little for a second test of validity and a
-second list to save.
+(excluded volume of spherocylinders, Onsager 1949).
+
+One list of one skin against others: sums of parts measured on one state, with lives counted along
+one run (20,000 segments of 5 diameters, V_f = 0.1, SIMD, strain 0.001 per step; ns per segment-step
+of list and pair sweep, skins in diameters). One list: 26 with a skin of 0.6 (build 249, every 15
+steps, sweep 9.4), 25 of 0.8. An outer list of 1.2 (build 348, every 32 steps) and one of 0.3
+filtered from it (distances 18, index 3, every 7 steps, sweep 5.9): 20, which is 5 of some 50 in
+all, for a second test of validity and a second list to save. Skins and extensions by the speed of
+each segment last 18 steps with the pairs that one skin needs for 14: few fibers, pushed by others,
+end any list (with half as many pairs 21 of the 20,000 segments in 20 steps, 136 in 40), so that
+such skins pay only if these are listed anew on their own.
 
 Nothing here looks at a clock: two runs, and a run and its continuation, choose the same skins and
 so build at the same steps.

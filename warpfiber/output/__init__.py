@@ -11,7 +11,9 @@ from warpfiber.output.checkpoint import (
     write_checkpoint,
 )
 from warpfiber.output.description import describe
+from warpfiber.output.fit_report import FitReport, fit_run
 from warpfiber.output.folder import ResultFolder
+from warpfiber.output.orientation_curve import exact_orientation
 from warpfiber.output.plots import plot_run
 from warpfiber.output.record_error import RecordError
 from warpfiber.output.scalars import ScalarsWriter, read_scalars
@@ -19,6 +21,7 @@ from warpfiber.output.trajectory import TrajectoryReader, TrajectoryWriter
 from warpfiber.output.usd import export_usd
 
 __all__ = [
+    "FitReport",
     "RecordError",
     "ResultFolder",
     "ScalarsWriter",
@@ -26,7 +29,9 @@ __all__ = [
     "TrajectoryWriter",
     "checkpoint_paths",
     "describe",
+    "exact_orientation",
     "export_usd",
+    "fit_run",
     "latest_checkpoint",
     "plot_run",
     "read_checkpoint",

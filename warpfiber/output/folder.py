@@ -132,6 +132,11 @@ class ResultFolder:
         """The summary; empty if there is none. Raises RecordError if damaged."""
         return _read_json(self.path / "summary.json")
 
+    def write_fit(self, name: str, content: Mapping[str, Any]) -> Path:
+        """Write the constants of a fit as `<name>.json`; returns its path."""
+        _write_json(self.path / f"{name}.json", content)
+        return self.path / f"{name}.json"
+
     def log(self, line: str) -> None:
         """Append one line to `log.txt`, after the wall time since this folder was opened."""
         elapsed = time.monotonic() - self._started
@@ -153,9 +158,15 @@ def _make_numbered(wanted: Path) -> Path:
             path = wanted.with_name(f"{wanted.name}_{number}")
 
 
+def _written(folder: Path) -> list[Path]:
+    """Files that a run, or a fit of it, may have written."""
+    found = [folder / name for name in _FILES]
+    return [*found, *folder.glob("checkpoint_*.h5"), *folder.glob("fit_*.json")]
+
+
 def _remove_results(folder: Path) -> None:
     """Delete what a run writes, and nothing else that lies in the folder."""
-    for path in [*(folder / name for name in _FILES), *folder.glob("checkpoint_*.h5")]:
+    for path in _written(folder):
         path.unlink(missing_ok=True)
     for name in saved_stages(folder):
         (folder / saved_stage_name(name)).unlink()

@@ -6,6 +6,7 @@ of a few fibers; `cell.png` is a picture of the cell at the end. Where layers we
 first run) `layers*.png` go through the thickness and `cut.png` is a section there.
 Points of `reference/*.csv` beside the scene are drawn over them: a header row with `strain` (or
 `time`) and columns named as in `scalars.csv` (`tip` for the tip); lines with # are comments.
+So is the exact orientation of the fibers without contact, where it applies or is asked for.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from warpfiber.output.curves import BLUE, FIGURES, GREEN, ORANGE, PURPLE, Curves
 from warpfiber.output.cut_picture import draw_cut
 from warpfiber.output.folder import ResultFolder
 from warpfiber.output.layer_figures import draw_layers
+from warpfiber.output.orientation_curve import exact_table, exact_without_contact
 from warpfiber.output.record_error import record_errors
 from warpfiber.output.scalars import read_scalars
 from warpfiber.output.trajectory import TrajectoryReader
@@ -51,19 +53,20 @@ class _Run:
     scene: Mapping[str, Any]
 
 
-def plot_run(folders: Any, out: str | Path | None = None) -> list[Path]:
+def plot_run(folders: Any, out: str | Path | None = None, exact: bool = False) -> list[Path]:
     """Draw all figures of one folder, or of several in the same axes; returns the PNG files.
 
     `folders`: path or ResultFolder, or a list of them. `out`: folder for the pictures, by default
-    `figures/` of the first run. A figure without data is left out. Raises SceneError if a folder
-    is missing, RecordError if a file is damaged or cannot be written.
+    `figures/` of the first run. A figure without data is left out. `exact`: draw the orientation
+    without contact also where fibers touch or bend. Raises SceneError if a folder is missing, or
+    has no exact orientation, RecordError if a file is damaged or cannot be written.
     """
     several = folders if isinstance(folders, (list, tuple)) else [folders]
     runs = [_read_run(folder) for folder in several]
     target = runs[0].folder.path / "figures" if out is None else Path(out)
     with record_errors(target, "make the folder"):
         target.mkdir(parents=True, exist_ok=True)
-    references = _references(runs[0])
+    references = _references(runs[0]) | _exact(runs[0], exact)
     written = []
     for curves in (*FIGURES, _tip_curves(runs)):
         path = target / f"{curves.name}.png"
@@ -157,6 +160,13 @@ def _references(run: _Run) -> dict[str, Table]:
         if body.ndim == 2 and body.shape[1] == len(names):
             found[path.stem] = {name: body[:, k] for k, name in enumerate(names)}
     return found
+
+
+def _exact(run: _Run, asked: bool) -> dict[str, Table]:
+    """The exact orientation without contact as one more table of points; may be empty."""
+    if not asked and not ("a11" in run.table and exact_without_contact(run.scene)):
+        return {}
+    return {"exact_without_contact": exact_table(run.folder)}
 
 
 def _known(curves: Curves, run: _Run) -> list[str]:

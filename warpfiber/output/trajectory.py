@@ -41,11 +41,13 @@ class TrajectoryWriter:
         scene_json: str,
         attrs: Mapping[str, Any],
         node_fields: Sequence[str] = (),
+        layer_columns: Sequence[str] = (),
     ) -> None:
         """Start a record of F fibers: `fiber_node_start` (F+1), `fiber_group` (F).
 
         `attrs` (hash, version, device, precision, seed ...) become attributes of `/warpfiber`;
-        `node_fields` names what every `append` brings per node. Raises RecordError if refused.
+        `node_fields` names what every `append` brings per node, `layer_columns` the columns of its
+        value `layers` (layers, columns). Raises RecordError if refused.
         """
         import h5py
 
@@ -60,6 +62,9 @@ class TrajectoryWriter:
             own = file.create_group("warpfiber")
             own.attrs["scene"] = scene_json
             own.attrs["node_fields"] = json.dumps(list(node_fields))
+            if layer_columns:
+                meanings = {name: column_meaning(name) for name in layer_columns}
+                own.attrs["layer_columns"] = json.dumps(meanings)
             for name, value in attrs.items():
                 if value is not None:
                     own.attrs[name] = value
@@ -153,7 +158,7 @@ class TrajectoryWriter:
             own = self._file["warpfiber"]
             _put(own, name, k, value[None])
             if k == 0:
-                _describe(own[name], name.removeprefix("layer_"))
+                _describe(own[name], name)
         steps = root["Steps"]
         _put(steps, "PointOffsets", k, np.array([k * nodes]))
         _put(steps, "PartOffsets", k, np.array([0]))

@@ -21,6 +21,7 @@ from warpfiber.passes.precision import group_struct
 from warpfiber.passes.unilateral import ContactDual
 
 BLOCK_SHARE = 32
+MOST_NUMBERS = 2**31 - 1  # places in `block` are of 32 bits
 
 
 @cache
@@ -130,15 +131,25 @@ def make_chain_apply(name: str, module: str = "unique") -> Any:
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         tension: wp.array(dtype=real),
+        segment_shift: wp.array(dtype=real),
     ):
         fiber = wp.tid() + offset
-        if status[wp.static(HALT)] != 0 or end_start[fiber] == end_start[fiber + 1]:
+        if status[wp.static(HALT)] != 0:
             return
         first = fiber_node_start[fiber]
         last = fiber_node_start[fiber + 1] - 1
+        if end_start[fiber] == end_start[fiber + 1]:
+            for i in range(first, last):
+                segment_shift[i - fiber] = real(0.0)
+            return
         dt = real(step_size[0])
         h_force = chi * dt * fiber_pace[fiber]
+        behind = real(0.0)
         for i in range(first, last + 1):
+            moved = wp.length(node_shift[i])
+            if i > first:
+                segment_shift[i - fiber - 1] = wp.max(behind, moved)
+            behind = moved
             node_pos[i] = node_pos[i] + node_shift[i]
             node_velocity[i] = node_velocity[i] + (carried / dt) * node_shift[i]
             if i < last:
@@ -168,8 +179,7 @@ class ChainResponse:
     ) -> None:
         most = max(row["segments"] for row in model.group_rows)
         self.relaxes = model.device.startswith("cpu") and most < MOST_NODES
-        share = BLOCK_SHARE + (4 * (most + 1) if self.relaxes else 0)
-        self.block_share = share if block_share is None else block_share
+        self.block_share = block_share
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
         ones = wp.full(model.fiber_count, p.real(1.0), p.real, device=model.device)
@@ -191,7 +201,8 @@ class ChainResponse:
         self.end_known = self._array(ends, wp.uint8)
         self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
         self.end_diagonal = self._array(ends, real)
-        self.block = self._array(self.block_share * ends, real)
+        share = BLOCK_SHARE if self.block_share is None else self.block_share
+        self.block = self._array(share * ends, real)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
         """Ends and blocks of every fiber, for rows of the present capacity."""
@@ -279,8 +290,14 @@ class ChainResponse:
         model, rows, law, p = self.model, dual.rows, dual.law, self.model.precision
         fibers, ends = model.fiber_count, 2 * rows.row_i.shape[0]
         nodes = 1 + max(row["segments"] for row in model.group_rows)
-        # hardly touched: what the rows of a step do not need stays out of memory
-        self.block = wp.empty(self.block_share * ends, dtype=p.real, device=model.device)
+        lanes = LANES[p.name]
+        if self.block_share is None:
+            # as much as there may be: what the rows of a step do not need stays out of memory
+            numbers = ends * (2 * BLOCK_SHARE + 4 * nodes)
+            numbers += lanes * (lanes * fibers + 4 * model.node_count)
+        else:
+            numbers = ends * self.block_share
+        self.block = wp.empty(min(numbers, MOST_NUMBERS), dtype=p.real, device=model.device)
         work = [
             self._array(REPLY_NUMBERS * len(model.group_rows), p.real),
             self.end_start,
@@ -289,7 +306,7 @@ class ChainResponse:
             self._array(ends, wp.int32),
             self._array(ends, p.real),
             self.block,
-            wp.empty(LANES[p.name] * (ends + LANES[p.name] + 4 * nodes), p.real, model.device),
+            wp.empty(lanes * (ends + lanes + 4 * nodes), dtype=p.real, device=model.device),
         ]
         inputs = [
             fibers,
@@ -343,6 +360,7 @@ class ChainResponse:
             state.node_pos,
             state.node_velocity,
             self.tension,
+            dual.segment_shift,
         ]
         kernel = make_chain_apply(model.precision.name, dual.module)
         return Launch("chain_apply", kernel, model.fiber_count, inputs, split=True)

@@ -1,15 +1,11 @@
 """Sweeps over the end of a step: overlaps, center lines that passed through each other, the list.
 
-One thread per segment looks at its outgoing pairs and its nodes; runs of segments are reduced in
-order, so the result does not depend on the workers.
+One thread per segment looks at its outgoing pairs that may have met and at its nodes; runs of
+segments are reduced in order, so the result does not depend on the workers.
 
-Source: four points that move in straight lines are in one plane where a cubic of the time is 0; the
-    lines pass through each other there if they meet between their ends. The cubic is split at its
-    extrema, its roots are found by bisection. Where it is 0 throughout (motion in a plane, parallel
-    lines) the distance is looked at in small steps of the time instead.
-Symbols: tau in [0, 1] time within the step; D(tau) from the start of a to the start of b, an image
-    with its box vector; V(tau) = D.(a x b); overlap (a_i + a_j - d) / min(a_i, a_j).
-Limits: all that moves, moves in a straight line over the step.
+Source: overlaps of closest points; crossings by `crossing`.
+Symbols: D from the start of a to the start of b, an image with its box vector; overlap
+    (a_i + a_j - d) / min(a_i, a_j).
 """
 
 from dataclasses import dataclass
@@ -18,16 +14,11 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import HALT, precision
+from warpfiber.passes.array_rows import PLACES, make_array_rows
+from warpfiber.passes.crossing import PLANAR, make_crossing
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import make_closest_points, make_wall_gap
-
-BISECTIONS = 52
-PLANAR_STEPS = 64
-# Volumes of less than this share of contact distance and lengths are only rounding.
-PLANAR = {"float32": 1e-5, "float64": 1e-9}
-INSIDE = 1e-9  # of a segment: a crossing at a joint is one of both segments
-NEAR_ZERO = 0.1  # of the contact distance: center lines this near in a plane have met
 
 
 @dataclass(frozen=True)
@@ -37,133 +28,23 @@ class CheckFeatures:
     periodic: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     frozen: bool = False  # some fibers are; nothing moves two of them, or one from a wall
-
-
-@cache
-def make_crossing(planar: float):
-    """`has_crossed(D, a, b, w, wa, wb, contact)`: whether two moving lines met; float64."""
-    closest_points = make_closest_points("float64")
-    zero, one, rounding = wp.float64(0.0), wp.float64(1.0), wp.float64(planar)
-    low, high = wp.float64(-INSIDE), wp.float64(1.0 + INSIDE)
-
-    @wp.func
-    def cubic(c: wp.vec4d, tau: wp.float64) -> wp.float64:
-        return c[0] + tau * (c[1] + tau * (c[2] + tau * c[3]))
-
-    @wp.func
-    def meet(
-        tau: wp.float64,
-        delta: wp.vec3d,
-        a: wp.vec3d,
-        b: wp.vec3d,
-        w: wp.vec3d,
-        wa: wp.vec3d,
-        wb: wp.vec3d,
-    ) -> wp.bool:
-        """Whether the lines, in one plane at tau, meet between their ends."""
-        d = delta + tau * w
-        p = a + tau * wa
-        q = b + tau * wb
-        normal = wp.cross(p, q)
-        area2 = wp.dot(normal, normal)
-        if not (area2 > zero):
-            return False
-        s = wp.dot(wp.cross(d, q), normal) / area2
-        t = wp.dot(wp.cross(d, p), normal) / area2
-        return s >= low and s <= high and t >= low and t <= high
-
-    @wp.func
-    def has_crossed(
-        delta: wp.vec3d,
-        a: wp.vec3d,
-        b: wp.vec3d,
-        w: wp.vec3d,
-        wa: wp.vec3d,
-        wb: wp.vec3d,
-        contact: wp.float64,
-    ) -> wp.bool:
-        n0 = wp.cross(a, b)
-        n1 = wp.cross(wa, b) + wp.cross(a, wb)
-        n2 = wp.cross(wa, wb)
-        c = wp.vec4d(
-            wp.dot(delta, n0),
-            wp.dot(delta, n1) + wp.dot(w, n0),
-            wp.dot(delta, n2) + wp.dot(w, n1),
-            wp.dot(w, n2),
-        )
-        size = wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2]) + wp.abs(c[3])
-        scale = rounding * contact * (wp.length(a) + wp.length(wa))
-        if size <= scale * (wp.length(b) + wp.length(wb)):
-            before = zero
-            for step in range(wp.static(PLANAR_STEPS + 1)):
-                tau = wp.float64(step) / wp.float64(wp.static(PLANAR_STEPS))
-                d = delta + tau * w
-                p = a + tau * wa
-                q = b + tau * wb
-                st = closest_points(d, p, q)
-                distance = wp.length(d + st[1] * q - st[0] * p)
-                if step == 0:
-                    before = distance
-                near = wp.float64(wp.static(NEAR_ZERO)) * contact
-                if distance < near and before >= near:
-                    return True
-            return False
-        # ends of the monotonic parts of the cubic
-        first = one
-        second = one
-        if wp.abs(c[3]) > wp.float64(1e-14) * size:
-            root = c[2] * c[2] - wp.float64(3.0) * c[3] * c[1]
-            if root > zero:
-                # the root without cancellation, and the other by their product
-                sum_of = -c[2] - wp.sqrt(root)
-                if c[2] < zero:
-                    sum_of = -c[2] + wp.sqrt(root)
-                first = sum_of / (wp.float64(3.0) * c[3])
-                second = first
-                if sum_of != zero:
-                    second = c[1] / sum_of
-        elif wp.abs(c[2]) > zero:
-            first = -c[1] / (wp.float64(2.0) * c[2])
-            second = first
-        left = wp.clamp(wp.min(first, second), zero, one)
-        right = wp.clamp(wp.max(first, second), zero, one)
-        begin = zero
-        for part in range(3):
-            end = left
-            if part == 1:
-                end = right
-            if part == 2:
-                end = one
-            u = begin
-            v = end
-            begin = end
-            at_u = cubic(c, u)
-            at_v = cubic(c, v)
-            if at_u * at_v <= zero and u < v:
-                for _step in range(wp.static(BISECTIONS)):
-                    middle = wp.float64(0.5) * (u + v)
-                    value = cubic(c, middle)
-                    if value * at_u > zero:
-                        u = middle
-                    else:
-                        v = middle
-                if meet(v, delta, a, b, w, wa, wb):
-                    return True
-        return False
-
-    return has_crossed
+    shifted: bool = False  # it is known how near pairs come but for contact, and what that adds
+    again: bool = False  # twice
+    arrays: bool = False  # some walls are arrays of fibers
 
 
 @cache
 def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"):
     """`check_segments`, `reduce_check`, `finish_check` in launch order, as a dict by name."""
     p = precision(name)
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     closest_points = make_closest_points(name)
     has_crossed = make_crossing(PLANAR[name])
     _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=features.periodic))
     has_wall, wall_gap = make_wall_gap(name, features.walls)
+    is_near_array, array_place, _ = make_array_rows(name)
+    has_arrays = features.arrays
     zero = real(0.0)
     lost = real(1e30)
     periodic = features.periodic
@@ -176,6 +57,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         widest: real,
         wall_low: vec3,
         wall_high: vec3,
+        wall_array: wp.array(dtype=vec2),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -189,6 +71,9 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         lattice_now: wp.array(dtype=mat33),
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        pair_clear: wp.array(dtype=real),
+        segment_shift: wp.array(dtype=real),
+        shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
         overlap_out: wp.array(dtype=real),
         overlap_partner_out: wp.array(dtype=wp.int32),
@@ -211,8 +96,19 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         crossed_partner = wp.int32(-1)
         if not (wp.length_sq(xi) < lost and wp.length_sq(a) < lost):
             largest = lost
+        mine = zero
+        if wp.static(features.shifted):
+            mine = segment_shift[i]
+            if wp.static(features.again):
+                mine += shift_again[i]
         for k in range(out_start[i], out_start[i + 1]):
             j = pair_j[k]
+            if wp.static(features.shifted):
+                shifted = mine + segment_shift[j]
+                if wp.static(features.again):
+                    shifted += shift_again[j]
+                if pair_clear[k] - shifted > real(2.0) * widest:
+                    continue
             node_j = segment_node[j]
             xj = node_pos[node_j]
             b = node_pos[node_j + 1] - xj
@@ -267,6 +163,13 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
                     if has_wall(axis):
                         for side in range(2):
                             y = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
+                            if wp.static(has_arrays):
+                                behind = wall_array[2 * axis + side][1]
+                                if behind > zero:  # past the middles of its fibers
+                                    if y + behind < zero:
+                                        crossed += 1
+                                        crossed_partner = -1
+                                    continue
                             overlap = (radius - y) / radius
                             if overlap > largest:
                                 largest = overlap
@@ -274,6 +177,32 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
                             if y < zero:
                                 crossed += 1
                                 crossed_partner = -1
+            if wp.static(has_arrays):
+                begin = 2 * first
+                if first == 2:
+                    begin = wp.static(PLACES)
+                for axis in range(1, 3):
+                    for side in range(2):
+                        shape = wall_array[2 * axis + side]
+                        if shape[1] == zero or not is_near_array(
+                            xi, xi + a, axis, side, wall_low, wall_high, radius
+                        ):
+                            continue
+                        for place in range(begin, wp.static(PLACES)):
+                            _t, _n, gap = array_place(
+                                place,
+                                xi,
+                                xi + a,
+                                axis,
+                                side,
+                                wall_low,
+                                wall_high,
+                                shape,
+                                radius,
+                            )
+                            if -gap / radius > largest:
+                                largest = -gap / radius
+                                partner = -1
         overlap_out[i] = largest
         overlap_partner_out[i] = partner
         crossed_out[i] = crossed

@@ -6,18 +6,22 @@ Symbols: run units; overlap in radii of the thinner fiber.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
+from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.unilateral import ContactDual
 
 CHUNKS = 128
 
@@ -42,14 +46,23 @@ class ContactCheck:
         lattice_back: Any,
         lattice_now: Any,
         fiber_frozen: Any = None,
+        solves: Sequence[tuple[ContactRows, ContactDual]] = (),
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
+        self.solves = solves
         self.node_back = node_back
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         domain, name = model.domain, model.precision.name
         none = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
-        features = CheckFeatures(any(domain.periodic), domain.wall, fiber_frozen is not None)
+        features = CheckFeatures(
+            any(domain.periodic),
+            domain.wall,
+            frozen=fiber_frozen is not None,
+            shifted=len(solves) > 0,
+            again=len(solves) > 1,
+            arrays=bool(domain.arrays),
+        )
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))
         self.kernels |= make_list_bound(name, module)
@@ -82,6 +95,7 @@ class ContactCheck:
             p.real(widest),
             p.vec3(*low),
             p.vec3(*(low + np.asarray(domain.size))),
+            wall_arrays(model),
             model.groups,
             model.fiber_node_start,
             model.fiber_group,
@@ -95,6 +109,8 @@ class ContactCheck:
             self.lattice_now,
             self.node_back,
             state.node_pos,
+            self.solves[0][0].pair_clear if self.solves else self.overlap,
+            *([dual.segment_shift for _, dual in self.solves] + 2 * [self.overlap])[:2],
             state.status,
             self.overlap,
             self.overlap_partner,

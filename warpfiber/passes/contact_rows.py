@@ -17,9 +17,11 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import Model, State
+from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.pair_motion import make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
 
@@ -32,9 +34,10 @@ class ContactRows:
 
     Rows (capacity): `row_i`, `row_j`, `row_s`, `row_t`, `row_normal`, `row_base`,
     `row_compliance`, `row_force`; those of segment i are `row_out_start[i:i+2]`, those of listed
-    pair k the `pair_row_count[k]` from `pair_row[k]` on; `row_count` (1) in all, `row_need` (1) is
-    0 unless they do not fit. `node_foreseen`: where the step is thought to end, which decides on
-    the rows that are made; where it would end without them unless given.
+    pair k the `pair_row_count[k]` from `pair_row[k]` on, `pair_clear` what its center lines surely
+    stay apart without contact; `row_count` (1) in all, `row_need` (1) is 0 unless they do not fit.
+    `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
+    where it would end without them unless given.
     """
 
     def __init__(
@@ -55,13 +58,19 @@ class ContactRows:
         self.model, self.state, self.pairs = model, state, pairs
         self.node_back, self.step_size = node_back, step_size
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
-        self.node_foreseen = state.node_pos if node_foreseen is None else node_foreseen
+        self.foresees = node_foreseen is not None
+        self.node_foreseen = node_foreseen if self.foresees else state.node_pos
         self.keep = keep
         domain = model.domain
-        self.features = RowFeatures(any(domain.periodic), domain.wall, lubrication)
+        self.features = RowFeatures(
+            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays)
+        )
         name, features = model.precision.name, self.features
         module = kernel_module("rows", name, features)
         self.kernels = dict(make_row_count(name, features, module))
+        native = model.device.startswith("cpu")
+        self.kernels["pair_motion"] = make_pair_motion(name, features.periodic, module, native)
+        self.motion_dim = native_chunks(model.segment_count) if native else model.segment_count
         self.kernels["fill_rows"] = make_row_fill(name, features, module)
         segments = model.segment_count
         self.row_out_start = self._int(segments + 1)
@@ -95,6 +104,12 @@ class ContactRows:
         self.pair_capacity = self.pairs.pair_capacity
         self.pair_row = self._int(self.pair_capacity)
         self.pair_row_count = self._int(self.pair_capacity)
+        real = self.model.precision.real
+        device = self.model.device
+        self.pair_clear = wp.zeros(self.pair_capacity, dtype=real, device=device)
+        self.pair_seen: Any = None  # the same of the foreseen motion, where it is another
+        if self.foresees:
+            self.pair_seen = wp.zeros(self.pair_capacity, dtype=real, device=device)
         self.pair_slots = wp.zeros(self.pair_capacity, dtype=wp.uint8, device=self.model.device)
 
     def grow(self) -> bool:
@@ -132,7 +147,9 @@ class ContactRows:
         ]
         return [
             self._launch("carry_rows", self._carry_inputs()),
-            self._launch("count_rows", self._count_inputs(), follows=True),
+            self._motion(self.state.node_pos, self.pair_clear),
+            *([self._motion(self.node_foreseen, self.pair_seen)] if self.foresees else []),
+            self._launch("count_rows", self._count_inputs()),
             Call("row_scan", scan),
             Launch("limit_rows", self.kernels["limit_rows"], 1, limit),
             self._launch("fill_rows", self._fill_inputs()),
@@ -141,6 +158,25 @@ class ContactRows:
     def _launch(self, name: str, inputs: list[Any], follows: bool = False) -> Launch:
         dim = self.model.segment_count
         return Launch(name, self.kernels[name], dim, inputs, split=True, follows=follows)
+
+    def _motion(self, node_pos: Any, pair_clear: Any) -> Launch:
+        model, pairs = self.model, self.pairs
+        inputs = [
+            model.segment_count,
+            model.segment_node,
+            pairs.out_start,
+            pairs.pair_i,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.lattice_back,
+            self.lattice_now,
+            self.node_back,
+            node_pos,
+            self.state.status,
+            pair_clear,
+        ]
+        kernel = self.kernels["pair_motion"]
+        return Launch("pair_motion", kernel, self.motion_dim, inputs, split=True, follows=True)
 
     def _carry_inputs(self) -> list[Any]:
         return [
@@ -158,7 +194,7 @@ class ContactRows:
     def _walls(self) -> list[Any]:
         vec3, domain = self.model.precision.vec3, self.model.domain
         low = np.asarray(domain.low)
-        return [vec3(*low), vec3(*(low + np.asarray(domain.size)))]
+        return [vec3(*low), vec3(*(low + np.asarray(domain.size))), wall_arrays(self.model)]
 
     def _fibers(self) -> list[Any]:
         model, pairs = self.model, self.pairs
@@ -186,6 +222,7 @@ class ContactRows:
             self.node_back,
             self.node_foreseen,
             self.state.status,
+            self.pair_clear if self.pair_seen is None else self.pair_seen,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,

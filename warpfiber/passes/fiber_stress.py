@@ -43,7 +43,7 @@ class FiberStress:
         self.fiber_frozen = wp.array(fiber_frozen, dtype=wp.uint8, device=model.device)
         self.kernels = make_measure_stress(model.precision.name)
         self.center = wp.zeros(model.fiber_count, dtype=wp.vec3d, device=model.device)
-        # step and contact moments of a restored state: its rows are made by the next step
+        # step and contact moments found last; of a restored state: the next step makes its rows
         self.kept: tuple[int, np.ndarray] | None = None
 
     def measure(self, rows: Iterable[Any]) -> dict[str, float]:
@@ -70,7 +70,13 @@ class FiberStress:
 
     def saved(self, rows: Iterable[Any]) -> np.ndarray:
         """Contact moments (6,) now, run units: what a restored state cannot tell."""
-        return self._moments(rows)[1] if self._step > 0 else np.zeros(len(STRESS))
+        step = self._step
+        if step == 0:
+            return np.zeros(len(STRESS))
+        if self.kept is None or self.kept[0] != step:
+            self._moments(rows)
+        assert self.kept is not None
+        return self.kept[1]
 
     def restore(self, contact: np.ndarray) -> None:
         """Take over what `saved` returned; the State has been restored."""
@@ -82,13 +88,14 @@ class FiberStress:
 
     def _moments(self, rows: Iterable[Any]) -> tuple[np.ndarray, np.ndarray]:
         """Moments (6,) of drag and of contact, run units; nan before the first step."""
-        step, unknown = self._step, np.full(len(STRESS), np.nan)
+        step = self._step
         if step == 0:
-            return unknown, unknown
+            return np.full(len(STRESS), np.nan), np.full(len(STRESS), np.nan)
         drag = self._drag()
-        if self.kept is not None and self.kept[0] == step:
-            return drag, self.kept[1]
-        return drag, sum((self._contact(solved) for solved in rows), np.zeros(len(STRESS)))
+        if self.kept is None or self.kept[0] != step:
+            contact = sum((self._contact(solved) for solved in rows), np.zeros(len(STRESS)))
+            self.kept = step, contact
+        return drag, self.kept[1]
 
     def _drag(self) -> np.ndarray:
         """Moments (6,) of the drag of all fibers, run units; leaves their middles."""

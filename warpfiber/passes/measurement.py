@@ -50,6 +50,7 @@ class Measurement:
         inertia: bool = True,
     ) -> None:
         self.model, self.state = model, state
+        self.counted = model.fiber_count  # of its fibers, the first ones; the others are absent
         self.inertia = inertia
         self.quantities = frozenset(quantities)
         self.pair_features = pair_features
@@ -129,7 +130,7 @@ class Measurement:
             self._fiber_kernel(),
             columns,
             len(FIBER_MAXIMA),
-            model.fiber_count,
+            self.counted,
             [
                 p.vec3(*low),
                 p.vec3(*(low + np.asarray(model.domain.size))),
@@ -146,7 +147,7 @@ class Measurement:
         row: dict[str, float] = {}
         if "orientation" in wanted:
             row |= {name: sums[name] / sums["length"] for name in TENSOR}
-            row |= {f"{n}_fiber": sums[f"{n}_fiber"] / model.fiber_count for n in TENSOR}
+            row |= {f"{n}_fiber": sums[f"{n}_fiber"] / self.counted for n in TENSOR}
         if features.orientation4:
             for name, value in zip(FIBER_SUMS4, values[len(FIBER_SUMS) :], strict=True):
                 by_number = name.endswith("_fiber")
@@ -177,7 +178,7 @@ class Measurement:
             largest = float(maxima[0])
             if "contacts" in wanted:
                 coordination = self._coordination(pairs, touches.numpy())
-        fibers = model.fiber_count
+        fibers = self.counted
         row: dict[str, float] = {}
         if "interactions" in wanted:
             row["interactions_per_fiber"] = 2.0 * (sums["repelling"] + sums["lubricating"]) / fibers
@@ -216,12 +217,12 @@ class Measurement:
         )
 
     def _coordination(self, pairs: NeighborList, touches: np.ndarray) -> float:
-        """Mean number of distinct fibers (images apart) that a fiber touches."""
+        """Mean number of distinct other fibers (images apart) that a fiber touches."""
         i, j, image = pairs.host_pairs()
-        touching = touches[: len(i)] != 0
         fiber = self.model.host["segment_fiber"]
+        touching = (touches[: len(i)] != 0) & (fiber[i] != fiber[j])
         keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
-        return 2.0 * len(np.unique(keys, axis=0)) / self.model.fiber_count
+        return 2.0 * len(np.unique(keys, axis=0)) / self.counted
 
 
 def measure_fiber_terms(

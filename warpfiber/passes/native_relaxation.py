@@ -11,9 +11,9 @@ Source: projected Gauss-Seidel, over-relaxed, in the order of the queue: the dua
         f <- max(0, f - OVER e/(D + C)),  D exact
     Rows of compliance C (lubrication) as in `dual_rows`; the exponential law, whose compliance
     changes with f, takes the largest.
-Symbols: e balance of a row, a length; `low` the largest e of either sign that it keeps.
-Limits: SHARE of the tolerance is the fault above which a row is relaxed: faults that are left are
-    of one size, where passes over all rows leave most of them far smaller.
+Symbols: e balance of a row, a length; `low` the largest e of either sign for which nobody is
+    visited again, SHARE of the tolerance; in the first look at all rows, which costs little, only
+    those with less than FINE of it keep their force.
 """
 
 from warpfiber.laws.repulsion import RANGE
@@ -22,6 +22,7 @@ from warpfiber.passes.dual_rows import BROKEN, NEXT_UPDATES
 
 OVER = 1.2
 SHARE = 0.5
+FINE = 0.02
 
 # y(f) as in `laws.contact_compliance`, and its largest slope; contact: the sum of two radii.
 OPENING = {
@@ -83,21 +84,22 @@ RELAX = """
     };
     long long relaxed = 0;
     const long long limit = (long long)most * count;
-    auto relax = [&](int r) -> bool {
+    // with more than a part of `low`; whether it had more than that
+    auto relax = [&](int r, T part) -> bool {
         Row& row = state[r];
         const T e = whole_balance(r);
         const T size = row.force == T(0) && row.soft == T(0) ? -e : wp::abs(e);
-        if (!(size > row.low)) return false;
+        if (!(size > part * row.low)) return false;
         if (row.step < T(0)) {
-            if (!(size > small)) return false;
+            if (!(size > part * small)) return false;
             prepare(r, diagonal_of(r));
-            if (!(size > row.low)) return false;
         }
         const T force = row.force - row.step * e;
         const T next = row.soft == T(0) && force < T(0) ? T(0) : force;
         const T change = next - row.force;
         row.force = next;
-        move(r, change);
+        if (change != T(0)) move(r, change);
+        if (!(size > row.low)) return false;
         ++relaxed;
         return true;
     };
@@ -108,32 +110,39 @@ RELAX = """
         const int at = head + held++;
         queue.data[at < fibers ? at : at - fibers] = f;
     };
-    auto look_at = [&](int r) {
-        if (relaxed >= limit || !relax(r)) return;
+    auto look_at = [&](int r, T part) {
+        if (relaxed >= limit || !relax(r, part)) return;
         visit_later(row_fiber(r, 0));
         visit_later(row_fiber(r, 1));
     };
     for (int f = 0; f < fibers; ++f) fiber_queued.data[f] = 0;
-    for (int r = 0; r < count; ++r) look_at(r);
-    while (held > 0 && relaxed < limit) {
-        const int f = queue.data[head];
-        head = head + 1 == fibers ? 0 : head + 1;
-        --held;
-        fiber_queued.data[f] = 0;
-        for (int r = row_first(f); r < row_last(f); ++r) look_at(r);
-        for (int k = in_start.data[f]; k < in_start.data[f + 1]; ++k) look_at(in_row.data[k]);
-    }
+    for (int r = 0; r < count; ++r) look_at(r, T(fine));
     T fault = T(0);
-    for (int r = 0; r < count; ++r) {
-        const Row& row = state[r];
-        row_force.data[r] = row.force;
-        if (row.low >= T(broken)) continue;
-        const T e = whole_balance(r);
-        T mine = row.force == T(0) && row.soft == T(0) ? (e < T(0) ? -e : T(0)) : wp::abs(e);
-        if (row.step > T(0)) mine *= T(1) - row.soft * row.step / T(over);
-        if (!(mine < T(broken)) || e != e) mine = T(broken);
-        fault = wp::max(fault, mine);
+    while (true) {
+        while (held > 0 && relaxed < limit) {
+            const int f = queue.data[head];
+            head = head + 1 == fibers ? 0 : head + 1;
+            --held;
+            fiber_queued.data[f] = 0;
+            for (int r = row_first(f); r < row_last(f); ++r) look_at(r, T(1));
+            for (int k = in_start.data[f]; k < in_start.data[f + 1]; ++k) 
+                look_at(in_row.data[k], T(1));
+        }
+        fault = T(0);
+        for (int r = 0; r < count; ++r) {
+            const Row& row = state[r];
+            if (row.low >= T(broken)) continue;
+            const T e = whole_balance(r);
+            T mine = row.force == T(0) && row.soft == T(0) ? (e < T(0) ? -e : T(0)) : wp::abs(e);
+            if (row.step > T(0)) mine *= T(1) - row.soft * row.step / T(over);
+            if (!(mine < T(broken)) || e != e) mine = T(broken);
+            fault = wp::max(fault, mine);
+            if (mine > T(tolerance) && mine < T(broken)) look_at(r, T(1));
+        }
+        // what small changes have added up to on rows that nobody visited again
+        if (held == 0 || relaxed >= limit) break;
     }
+    for (int r = 0; r < count; ++r) row_force.data[r] = state[r].force;
     best.data[1] = fault;
     control.data[next_updates] = (relaxed + count - 1) / count;
 """
@@ -155,7 +164,8 @@ def relaxation_texts(name: str, law: str) -> tuple[str, str, str]:
     real = {"float32": "float", "float64": "double"}[precision(name).name]
     numbers = f"""
     typedef {real} T;
-    constexpr double over = {OVER!r}, share = {SHARE!r}, broken = {BROKEN!r};
+    constexpr double over = {OVER!r}, share = {SHARE!r}, fine = {FINE!r};
+    constexpr double broken = {BROKEN!r};
     constexpr double edge = {RANGE - 1.0!r};
     constexpr bool yields = {str(law != "hard").lower()};
     constexpr int next_updates = {NEXT_UPDATES};

@@ -108,6 +108,7 @@ def make_rod_apply(name: str, module: str = "unique"):
         status: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
+        segment_shift: wp.array(dtype=real),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -115,14 +116,19 @@ def make_rod_apply(name: str, module: str = "unique"):
         i = 2 * fiber
         shift0 = node_shift[i]
         shift1 = node_shift[i + 1]
+        segment_shift[fiber] = real(0.0)
         if wp.dot(shift0, shift0) + wp.dot(shift1, shift1) == real(0.0):
             return
-        x0 = node_pos[i] + shift0
-        x1 = node_pos[i + 1] + shift1
+        from0 = node_pos[i]
+        from1 = node_pos[i + 1]
+        x0 = from0 + shift0
+        x1 = from1 + shift1
         center = half * (x0 + x1)
         lever = (half * groups[fiber_group[fiber]].rest) * wp.normalize(x1 - x0)
         node_pos[i] = center - lever
         node_pos[i + 1] = center + lever
+        moved0 = wp.length(center - lever - from0)
+        segment_shift[fiber] = wp.max(moved0, wp.length(center + lever - from1))
         share = carried / real(step_size[0])
         node_velocity[i] = node_velocity[i] + share * shift0
         node_velocity[i + 1] = node_velocity[i + 1] + share * shift1
@@ -224,6 +230,7 @@ class RodResponse:
             state.status,
             state.node_pos,
             state.node_velocity,
+            dual.segment_shift,
         ]
         kernel = make_rod_apply(model.precision.name, dual.module)
         return Launch("rod_apply", kernel, model.fiber_count, inputs, split=True)

@@ -15,6 +15,7 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.model import HALT, precision
+from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.bead_rows import make_bead_rows
 from warpfiber.passes.pairs import NO_IMAGE, PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
@@ -33,13 +34,14 @@ class RowFeatures:
     periodic: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     lubrication: str = "none"  # none, paper, shifted
+    arrays: bool = False  # some walls are arrays of fibers
 
 
 @cache
 def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
     """`carry_rows`, `count_rows`, `limit_rows` in launch order, as a dict by name."""
     p = precision(name)
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     largest_motion, _, _, kept_slots = make_row_geometry(name)
     closest_points = make_closest_points(name)
@@ -47,6 +49,8 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
     owned_beads, bead_range, bead_resistance = make_bead_rows(name, is_shifted)
     _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=features.periodic))
     has_wall, wall_gap = make_wall_gap(name, features.walls)
+    is_near_array, array_place, _ = make_array_rows(name)
+    has_arrays = features.arrays
     zero = real(0.0)
     outer = real(OUTER)
     periodic = features.periodic
@@ -84,6 +88,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         widest: real,
         wall_low: vec3,
         wall_high: vec3,
+        wall_array: wp.array(dtype=vec2),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -97,6 +102,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        pair_clear: wp.array(dtype=real),
         pair_slots_out: wp.array(dtype=wp.uint8),
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
@@ -111,8 +117,15 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
         reach = (real(2.0) + keep) * widest
+        looked_at = reach
+        if wp.static(has_lubrication):
+            looked_at = wp.max(reach, real(2.0) * outer * widest)
         total = wp.int32(0)
         for k in range(out_start[i], out_start[i + 1]):
+            if pair_clear[k] > looked_at:
+                pair_slots_out[k] = wp.uint8(0)
+                pair_row_count_out[k] = 0
+                continue
             j = pair_j[k]
             node_j = segment_node[j]
             xj = node_back[node_j]
@@ -213,8 +226,40 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                 for axis in range(3):
                     if has_wall(axis):
                         for side in range(2):
+                            if wp.static(has_arrays):
+                                if wall_array[2 * axis + side][1] > zero:
+                                    continue
                             y = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
                             if y - radius < keep * radius:
+                                total += 1
+            if wp.static(has_arrays):
+                moved = wp.max(wp.length(move_i), wp.length(move_i + wa))
+                for axis in range(1, 3):
+                    for side in range(2):
+                        shape = wall_array[2 * axis + side]
+                        if shape[1] == zero or not is_near_array(
+                            xi,
+                            xi + a,
+                            axis,
+                            side,
+                            wall_low,
+                            wall_high,
+                            (real(1.0) + keep) * radius + moved,
+                        ):
+                            continue
+                        for place in range(2 * first, wp.static(PLACES)):
+                            t, n, gap = array_place(
+                                place,
+                                xi,
+                                xi + a,
+                                axis,
+                                side,
+                                wall_low,
+                                wall_high,
+                                shape,
+                                radius,
+                            )
+                            if gap - wp.dot(n, move_i + t * wa) < keep * radius:
                                 total += 1
         segment_rows_out[i] = total
 

@@ -13,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import HALT, precision
+from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.bead_rows import make_bead_rows
 from warpfiber.passes.pairs import PairFeatures, make_image, make_pair_geometry
 from warpfiber.passes.precision import group_struct
@@ -30,7 +31,7 @@ KEY_BEADS = (7, 8209, 131101)
 def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
     """Kernel `fill_rows` in the given precision with the given features, over segments."""
     p = precision(name)
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
     _, row_fractions, row_normal_gap, _ = make_row_geometry(name)
     is_shifted = features.lubrication == "shifted"
@@ -38,6 +39,8 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
     _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=features.periodic))
     unpack_image = make_image(name)
     has_wall, wall_gap = make_wall_gap(name, features.walls)
+    is_near_array, array_place, array_key = make_array_rows(name)
+    has_arrays = features.arrays
     zero = real(0.0)
     periodic = features.periodic
     has_lubrication = features.lubrication != "none"
@@ -75,6 +78,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
         keep: real,
         wall_low: vec3,
         wall_high: vec3,
+        wall_array: wp.array(dtype=vec2),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -213,6 +217,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                 for axis in range(3):
                     if has_wall(axis):
                         for side in range(2):
+                            if wp.static(has_arrays):
+                                if wall_array[2 * axis + side][1] > zero:
+                                    continue
                             gap = wall_gap(node_foreseen[node], axis, side, wall_low, wall_high)
                             if gap - gi.radius < keep * gi.radius:
                                 gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
@@ -226,6 +233,56 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 row_t_out[r] = zero
                                 row_normal_out[r] = normal
                                 row_base_out[r] = gap - gi.radius
+                                row_compliance_out[r] = zero
+                                row_force_out[r] = carried_row_force(
+                                    wp.static(WALL),
+                                    key,
+                                    first_carried,
+                                    last_carried,
+                                    carried_j,
+                                    carried_key,
+                                    carried_force,
+                                )
+                                r += 1
+            if wp.static(has_arrays):
+                seen_i = node_foreseen[node_i] - xi
+                seen_a = node_foreseen[node_i + 1] - xi - a - seen_i
+                moved = wp.max(wp.length(seen_i), wp.length(seen_i + seen_a))
+                for axis in range(1, 3):
+                    for side in range(2):
+                        shape = wall_array[2 * axis + side]
+                        if shape[1] == zero or not is_near_array(
+                            xi,
+                            xi + a,
+                            axis,
+                            side,
+                            wall_low,
+                            wall_high,
+                            (real(1.0) + keep) * gi.radius + moved,
+                        ):
+                            continue
+                        for place in range(2 * first, wp.static(PLACES)):
+                            t, normal, gap = array_place(
+                                place,
+                                xi,
+                                xi + a,
+                                axis,
+                                side,
+                                wall_low,
+                                wall_high,
+                                shape,
+                                gi.radius,
+                            )
+                            if gap - wp.dot(normal, seen_i + t * seen_a) < keep * gi.radius:
+                                base = gap - wp.dot(normal, move_i + t * wa)
+                                key = array_key(place, xi, xi + a, axis, side, wall_low, shape)
+                                row_i_out[r] = i
+                                row_j_out[r] = wp.static(WALL)
+                                row_key_out[r] = key
+                                row_s_out[r] = t
+                                row_t_out[r] = zero
+                                row_normal_out[r] = normal
+                                row_base_out[r] = base
                                 row_compliance_out[r] = zero
                                 row_force_out[r] = carried_row_force(
                                     wp.static(WALL),

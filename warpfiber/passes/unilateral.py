@@ -125,6 +125,9 @@ class ContactDual:
             "dual", model.precision.name, self.law.kind, self.has_frozen, response.by_ends
         )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
+        # how far contact moved each segment off its motion without, at most
+        real, segments = model.precision.real, model.segment_count
+        self.segment_shift = wp.zeros(segments, dtype=real, device=model.device)
         self.fiber_in = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
         # runs of rows, and of their sums (0: these are not folded)
         on_cpu = device.startswith("cpu")

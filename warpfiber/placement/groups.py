@@ -42,6 +42,8 @@ class GroupFibers:
     segments: int = 0
     tensor: Floats | None = None
     """orientation tensor asked for, (3, 3); None: nodes from a file"""
+    law: str = "acg"
+    """distribution of directions"""
     drawn: Floats | None = None
     """orientation tensor of the directions before packing, (3, 3)"""
     direction: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -86,7 +88,7 @@ class GroupFibers:
             return None
         center = None if self.given is None else self.given[f][None, :]
         for _ in range(ROUNDS):
-            fresh = draw_directions(self.tensor, 1, rng)
+            fresh = draw_directions(self.tensor, 1, rng, self.law)
             if not len(self.misfits(fresh, center)):
                 self.redrawn += 1
                 return np.asarray(fresh[0])
@@ -151,7 +153,7 @@ def _from_statistics(
     made = GroupFibers(
         index, cell, group.radius, 0.5 * group.centerline_length, group.segments, tensor
     )
-    n = group.count
+    n, made.law = group.count, group.orientation_law
     made.apart = scene.contact.law != "none"
     made.center = np.zeros((n, 3))
     if not isinstance(group.position, str):
@@ -164,7 +166,7 @@ def _from_statistics(
     if asked == "aligned":
         made.direction = np.tile(_aligned(group.direction), (n, 1))
     else:
-        made.direction = match_moments(draw_directions(tensor, n, rng), tensor)
+        made.direction = match_moments(draw_directions(tensor, n, rng, made.law), tensor)
     bad = _redraw_misfits(made, rng)
     for _ in range(MATCHES):
         if not made.redrawn or len(bad):
@@ -196,7 +198,7 @@ def _redraw_misfits(made: GroupFibers, rng: np.random.Generator) -> Ints:
         if not len(bad) or not np.any(made.turning):
             break
         made.redrawn += len(bad)
-        made.direction[bad] = draw_directions(made.tensor, len(bad), rng)
+        made.direction[bad] = draw_directions(made.tensor, len(bad), rng, made.law)
         given = None if made.given is None else made.given[bad]
         bad = bad[made.misfits(made.direction[bad], given)]
     return bad

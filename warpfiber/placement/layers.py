@@ -59,6 +59,8 @@ class Stack:
     """orientation tensors, (K, 3, 3)"""
     inside: bool
     """whether each fiber stays in its layer"""
+    law: str = "acg"
+    """distribution of directions"""
 
     def __len__(self) -> int:
         return len(self.share)
@@ -133,7 +135,8 @@ def _drawn(
     direction = np.zeros((n, 3))
     for k in range(len(stack)):
         mine = np.flatnonzero(layer == k)
-        direction[mine] = draw_directions(tensor[k], len(mine), np.random.default_rng([seed, k]))
+        own = np.random.default_rng([seed, k])
+        direction[mine] = draw_directions(tensor[k], len(mine), own, stack.law)
         for rows in np.array_split(mine, min(CLASSES, max(1, len(mine) // CLASS))):
             direction[rows] = match_moments(direction[rows], tensor[k])
     redrawn = 0
@@ -144,7 +147,7 @@ def _drawn(
         left = []
         for k in np.unique(layer[bad]):
             rows = np.repeat(bad[layer[bad] == k], CANDIDATES)
-            fresh = draw_directions(tensor[k], len(rows), rng)
+            fresh = draw_directions(tensor[k], len(rows), rng, stack.law)
             fits = np.ones(len(rows), dtype=bool)
             fits[_misfits(stack, fresh, layer[rows], half[rows], radius, cell)] = False
             found = np.argmax(fits.reshape(-1, CANDIDATES), axis=1)

@@ -1,5 +1,6 @@
 """Directions of straight fibers from a second-order orientation tensor.
 
+Law `acg` (default) or `bingham` (see `bingham`).
 Source: angular central Gaussian (ACG) distribution, p = C^(1/2) z / |C^(1/2) z| with z normal
     (Tyler, Biometrika 74 (1987) 579): what random directions become in a linear flow. Its second
     moments are Carlson's R_D (Carlson, Numer. Algorithms 10 (1995) 13, duplication).
@@ -15,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warpfiber.placement.bingham import draw_bingham
 from warpfiber.placement.capsules import Floats
 
 FLAT = 1e-9
@@ -111,9 +113,14 @@ def acg_covariance(eigen: Floats) -> Floats:
     return np.asarray(c / c.sum())
 
 
-def draw_directions(tensor: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """`count` random unit vectors (n, 3), ACG with second moment A."""
+def draw_directions(
+    tensor: Floats, count: int, rng: np.random.Generator, law: str = "acg"
+) -> Floats:
+    """`count` random unit vectors (n, 3) with second moment A, by law `acg` or `bingham`."""
     eigen, axes = np.linalg.eigh(tensor)
+    live = eigen > FLAT
+    if law == "bingham" and np.count_nonzero(live) > 1:
+        return np.asarray(draw_bingham(eigen[live], count, rng) @ axes[:, live].T)
     spread = np.sqrt(acg_covariance(np.maximum(eigen, 0.0)))
     raw = rng.standard_normal((count, 3)) * spread
     length = np.linalg.norm(raw, axis=1)

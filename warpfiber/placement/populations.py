@@ -115,6 +115,7 @@ def stack_of(scene: Scene, table: int, group: FiberGroup) -> Stack:
                 fraction,
                 asked_tensor(group.orientation, group.direction)[None],
                 False,
+                group.orientation_law,
             )
         tensor = []
         for k, layer in enumerate(group.layers):
@@ -127,9 +128,9 @@ def stack_of(scene: Scene, table: int, group: FiberGroup) -> Stack:
     edges = np.append(0.0, np.cumsum(thickness))
     edges *= height / edges[-1]
     share = thickness * fraction
-    return Stack(
-        edges, share / share.sum(), fraction, np.array(tensor), group.layer_mode == "inside"
-    )
+    inside = group.layer_mode == "inside"
+    law = group.orientation_law
+    return Stack(edges, share / share.sum(), fraction, np.array(tensor), inside, law)
 
 
 def pack(

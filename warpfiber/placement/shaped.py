@@ -47,7 +47,7 @@ def insert_shaped(
         tensor = asked_tensor(group.orientation, group.direction)
     except ValueError as problem:
         raise error("orientation", group.orientation, str(problem)) from problem
-    direction = draw_directions(tensor, group.count, rng)
+    direction = draw_directions(tensor, group.count, rng, group.orientation_law)
     if group.orientation != "aligned":
         direction = match_moments(direction, tensor)
     made.tensor, made.segments = tensor, group.segments

@@ -19,18 +19,17 @@ class Row:
     advice: str
 
 
-STAGE_ADVICE = 'only kind = "flow", "settle", "compress", "unload", "pull" and "shear" run'
-
 NOT_IN_THIS_VERSION: tuple[Row, ...] = (
     Row("flow", "kind", ("simple_shear", "planar_extension", "uniaxial_extension", "gradient",
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
-    Row("stage", "kind", ("flow", "settle", "compress", "unload", "pull", "shear"), STAGE_ADVICE),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
-                                 "curvature", "stress"),
+                                 "curvature", "stress", "inclination"),
         "remove the others from the list"),
-    Row("record", "node_fields", ("velocity",), "remove the others from the list"),
-    Row("wall", "", (), 'remove the table; walls come from boundary = "wall", stages move them'),
+    Row("record", "node_fields", ("velocity", "bond_stress", "contact_count"),
+        "remove the others from the list"),
+    Row("wall", "kind", ("fiber_array",),
+        'remove the table; planes come from boundary = "wall", stages move them'),
 )  # fmt: skip
 
 
@@ -48,6 +47,7 @@ FLOWING = (
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+    Row("record", "node_fields", ("velocity",), "remove it; it is of method bonded_spheres"),
 )
 SOFT = Row("contact", "law", ("none", "exponential", "linear"),
            'use law = "exponential", "linear" or "none"')  # fmt: skip
@@ -78,8 +78,8 @@ NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
         Row("numerics", "closure", ("consistent",), 'use closure = "consistent"'),
     ),
     "bonded_spheres": (
-        Row("stage", "kind", ("settle", "compress", "unload", "pull", "shear"),
-            'there is no fluid; use kind = "settle", "compress", "unload", "pull" or "shear"'),
+        Row("stage", "kind", ("settle", "pour", "compress", "unload", "pull", "shear"),
+            'there is no fluid; use kind = "settle", "compress" or another one'),
         Row("contact", "law", ("none", "hertz"), 'use law = "hertz", or "none"'),
         Row("contact", "lubrication", ("none",), "remove it; there is no fluid"),
         Row("numerics", "contact", ("penalty",), 'use contact = "penalty"'),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from warpfiber.scene.arrays import check_arrays
 from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
 from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
@@ -15,6 +16,7 @@ from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, check_gripping
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
+from warpfiber.scene.pouring import check_pouring
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
 from warpfiber.scene.starting import check_saving
@@ -47,9 +49,11 @@ def cross_check(draft: Draft) -> None:
     _check_stages(draft)
     _check_rest(draft)
     _check_record(draft)
+    check_arrays(draft)
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)
+    check_pouring(draft)
     check_saving(draft)
 
 

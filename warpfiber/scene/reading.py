@@ -33,7 +33,7 @@ from warpfiber.scene.schema import (
     WALL,
 )
 from warpfiber.scene.starting import take_start
-from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape, Start
+from warpfiber.scene.tables import Box, Contact, FiberGroup, Gravity, Load, Shape, Start, Wall
 
 T = TypeVar("T")
 TOML_PLACE = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
@@ -258,8 +258,8 @@ def _finished(
             _made(FiberGroup, group | {"shape": _made(Shape, group["shape"])})
             for group in draft.fibers
         ),
-        walls=saved.walls if saved is not None else (),
         contact=_made(Contact, draft.contact),
+        walls=saved.walls if saved is not None else tuple(_made(Wall, w) for w in draft.walls),
         gravity=_made(Gravity, draft.gravity) if draft.gravity is not None else None,
         loads=tuple(_made(Load, load) for load in draft.loads),
         stages=tuple(_made(Stage, stage) for stage in draft.stages),

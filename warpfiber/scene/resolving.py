@@ -14,7 +14,7 @@ from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, strain_time
 from warpfiber.scene.keys import Values
 from warpfiber.scene.pressing import PRESSING, loading_time, passing_time
-from warpfiber.scene.statistics import resolve_layers, resolve_lengths
+from warpfiber.scene.statistics import check_law, resolve_layers, resolve_lengths
 from warpfiber.scene.tables import Flow
 
 LENGTH_KEYS = ("aspect_ratio", "length", "centerline_length", "length_distribution")
@@ -37,6 +37,7 @@ def resolve(draft: Draft) -> None:
     for index, group in enumerate(draft.fibers if draft.saved is None else ()):
         resolve_lengths(draft, group, f"fibers.{index}")
         resolve_layers(draft, group, f"fibers.{index}")
+        check_law(draft, group, f"fibers.{index}")
         _resolve_length(draft, group, f"fibers.{index}")
         _resolve_group(draft, group, f"fibers.{index}")
         _resolve_count(draft, group, f"fibers.{index}")
@@ -122,7 +123,7 @@ def _resolve_group(draft: Draft, group: Values, path: str) -> None:
         if not file.is_file():
             draft.blame(f"{path}.node_file", f"no such file: {file}; it is sought beside the scene")
         group["node_file"] = str(file.absolute())
-        for key in ("orientation", "direction", "position", "shape"):
+        for key in ("orientation", "direction", "orientation_law", "position", "shape"):
             if draft.is_given(f"{path}.{key}"):
                 draft.note(f"{path}.{key} has no effect; node_file has the nodes")
 
@@ -275,6 +276,8 @@ def _resolve_stages(draft: Draft) -> None:
             stage["end_time"] = min(seconds, stage["end_time"] or seconds)
         if stage["kind"] in GRIPPING and stage["freeze"] is None:
             stage["freeze"] = "fibers"
+        for key, default in (("batch", 1), ("interval", 0.0), ("damping", 0.0)):
+            stage[key] = default if stage[key] is None else stage[key]
         if stage["repeat"] is None:
             stage["repeat"] = 1
 

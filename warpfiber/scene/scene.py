@@ -34,7 +34,7 @@ class Stage:
     """One `[[stage]]`: what happens until its first end condition, counted from its start."""
 
     kind: str
-    """flow, settle, compress, unload, pull, shear"""
+    """flow, settle, pour, compress, unload, pull, shear"""
     name: str
     """the kind, if none was given"""
     save: bool = False
@@ -57,7 +57,11 @@ class Stage:
     pressure_rate: float | None = None
     """Pa/s"""
     damping: float = 0.0
-    """1/s on the velocities of the nodes, of `settle`"""
+    """1/s on the velocities of the nodes, of `settle` and `pour`"""
+    interval: float = 0.0
+    """s from batch to batch that is poured"""
+    batch: int = 1
+    """fibers that are poured at a time"""
     freeze_below: float | None = None
     """m, height up to which the bed is held still in pull and shear"""
     freeze_above: float | None = None

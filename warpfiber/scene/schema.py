@@ -31,6 +31,7 @@ VECTOR = ListOf(ANY, count=3)
 POINT = ListOf(Number("m"), count=3)
 SPEED = ListOf(Number("m/s"), count=3)
 CSV_FILE = Text("the name of a .csv file", (".csv",))
+BIN = ListOf(ANY, count=3, what="[lower (m), upper (m), count]")
 
 INERTIAL = ("bead_chain", "bonded_spheres")
 ORIENTATION = Either((Choice(("isotropic", "planar", "aligned")), OrientationTensor()))
@@ -110,7 +111,7 @@ LENGTH_DISTRIBUTION = Table(
         Key("weight_average", LENGTH),
         Key("maximum", LENGTH),
         Key("minimum", LENGTH),
-        Key("histogram", CSV_FILE),
+        Key("histogram", Either((CSV_FILE, ListOf(BIN, least=1, what="bins")))),
         Key("kunc_diameter", LENGTH),
     ),
     one_of=(OneOf(("number_average", "histogram")), OneOf(("weight_average", "histogram"))),
@@ -156,6 +157,7 @@ FIBERS = Table(
         Key("shape", Inline(SHAPE), default={"kind": "straight"}),
         Key("orientation", ORIENTATION, default="isotropic"),
         Key("direction", Direction()),
+        Key("orientation_law", Choice(("acg", "bingham")), default="acg"),
         Key("position", Either((Choice(("random",)), ListOf(POINT, least=1), POINT))),
         Key("node_file", Text("the name of a .npz or .csv file", (".npz", ".csv"))),
         Key("initial_velocity", Either((Choice(("flow", "rest")), SPEED))),
@@ -252,6 +254,7 @@ STAGE = Table(
         Key("pressure_rate", Number("Pa/s", above=0), required=True, when=("control", ("load",))),
         Key("damping", Number("1/s", least=0), default=0.0, when=("kind", ("settle", "pour"))),
         Key("interval", Number("s", least=0), default=0.0, when=("kind", ("pour",))),
+        Key("batch", COUNT, when=("kind", ("pour",))),
         Key("freeze_below", Number("m"), required=True, when=("kind", DRAG)),
         Key("freeze_above", Number("m"), required=True, when=("kind", DRAG)),
         Key("freeze", Choice(("fibers", "nodes")), when=("kind", DRAG)),

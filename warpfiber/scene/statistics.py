@@ -1,7 +1,8 @@
 """Lengths and layers of a fiber group: their tables and CSV files, completed and checked.
 
-A histogram has the columns lower,upper,count (m, m, number; bins from short to long without gaps);
-layers have thickness,volume_fraction,a11,a22,a33,a12,a13,a23 (m; from z = 0 up).
+A histogram has the columns lower,upper,count (m, m, number; bins from short to long without gaps),
+in a file or as a list of such rows; layers have thickness,volume_fraction,a11,a22,a33,a12,a13,a23
+(m; from z = 0 up), or are a list of tables.
 Limits: what one table alone shows; whether the fibers can be packed is known after placing them.
 """
 
@@ -21,6 +22,10 @@ HISTOGRAM = ("lower", "upper", "count")
 LAYERS = ("thickness", "volume_fraction", "a11", "a22", "a33", "a12", "a13", "a23")
 SHORTEST = 2.0
 """Default of the shortest fiber in diameters: one segment as long as the diameter."""
+ROUNDED = 1e-7
+"""What an eigenvalue of zero may become by the rounding of its formula: sqrt of it, of angles."""
+FLATTEST = 1e-4
+"""Smallest eigenvalue, other than 0, of an orientation tensor of law bingham."""
 SUM_ERROR = 1e-6
 """Relative error at which thicknesses still add up to the height, gaps between bins are none."""
 
@@ -37,7 +42,9 @@ def resolve_lengths(draft: Draft, group: Values, path: str) -> None:
     least = SHORTEST * group["diameter"]
     rows = None
     if values["histogram"] is not None:
-        rows = _rows(draft, dotted(place, "histogram"), values["histogram"], HISTOGRAM)
+        rows = values["histogram"]
+        if isinstance(rows, str):
+            rows = _rows(draft, dotted(place, "histogram"), rows, HISTOGRAM)
         if rows is None or _bad_histogram(draft, dotted(place, "histogram"), rows):
             return
         values["kind"], longest = "histogram", rows[-1][1]
@@ -159,6 +166,37 @@ def resolve_layers(draft: Draft, group: Values, path: str) -> None:
     group["layers"] = layers
     group["layer_mode"] = group["layer_mode"] or "span"
     group["volume_fraction"] = math.fsum(x.volume_fraction * x.thickness for x in layers) / total
+
+
+def check_law(draft: Draft, group: Values, path: str) -> None:
+    """Report tensors that are too flat for law bingham; call after `resolve_layers`."""
+    if group["orientation_law"] != "bingham" or group["node_file"] is not None:
+        return
+    asked = [(dotted(path, "orientation"), group["orientation"])]
+    if group["layers"]:
+        asked = [(dotted(path, "layers"), layer.orientation) for layer in group["layers"]]
+    for key, tensor in asked:
+        if isinstance(tensor, tuple) and ROUNDED < smallest_eigenvalue(tensor) < FLATTEST:
+            least = number_text(float(f"{smallest_eigenvalue(tensor):.3g}"))
+            remedy = f"smallest eigenvalue {least}; law bingham takes 0, or {FLATTEST:g} and more"
+            draft.blame(key, remedy + '; or set orientation_law = "acg"')
+            return
+
+
+def smallest_eigenvalue(tensor: tuple[float, ...]) -> float:
+    """Of a symmetric tensor a11, a22, a33, a12, a13, a23, by the trigonometric formula."""
+    a11, a22, a33, a12, a13, a23 = tensor
+    mean = (a11 + a22 + a33) / 3.0
+    x, y, z = a11 - mean, a22 - mean, a33 - mean
+    off = a12 * a12 + a13 * a13 + a23 * a23
+    size = math.sqrt((x * x + y * y + z * z + 2.0 * off) / 6.0)
+    if size == 0.0:
+        return mean
+    determinant = (
+        x * (y * z - a23 * a23) - a12 * (a12 * z - a23 * a13) + a13 * (a12 * a23 - y * a13)
+    )
+    turn = math.acos(max(-1.0, min(1.0, 0.5 * determinant / size**3))) / 3.0
+    return mean + 2.0 * size * math.cos(turn + 2.0 * math.pi / 3.0)
 
 
 def _layer(draft: Draft, values: Values, path: str) -> Layer:

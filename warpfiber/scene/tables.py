@@ -194,6 +194,8 @@ class FiberGroup:
     """isotropic, planar (in xy), aligned, or a11, a22, a33, a12, a13, a23"""
     direction: Vector | None = None
     """unit vector, if aligned"""
+    orientation_law: str = "acg"
+    """distribution with that tensor: acg (angular central Gaussian), bingham"""
     position: str | tuple[Vector, ...]
     """random, or centers in m: one per fiber, or one that all share"""
     node_file: str | None = None

@@ -1,0 +1,213 @@
+"""How near every listed pair surely stays during a step: what rows and checks may pass over.
+
+Source: no two points of two segments approach each other by more than the largest relative motion
+    of their ends, so the center lines stay apart by `clear` = distance at the start - that motion.
+    Contact moves the fibers further, which a check adds.
+Symbols: as in `row_geometry`: D, a, b at the start, w, wa, wb the motion of the step, an image with
+    its box vector at both times.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfiber.model import HALT, precision
+from warpfiber.passes.native import lane_types
+from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE, PairFeatures, make_pair_geometry
+from warpfiber.passes.row_geometry import PARALLEL, make_closest_points, make_row_geometry
+
+CHUNK_SEGMENTS = 64  # per launch index on the CPU: workers share pairs in such portions
+
+# Rows (x, y, z, unused) of a pair as they lie in memory, then transposed to a vector per component;
+# the second node of a segment is read from its end, so that nothing behind the last is touched.
+BLOCK = """
+    typedef T R __attribute__((ext_vector_type(4)));
+    auto load = [](const T* p) -> R { R r; __builtin_memcpy(&r, p, sizeof(r)); return r; };
+    auto transposed = [](const R* m) -> V3 {
+        V3 p;
+        for (int q = 0; q < W; q += 4) {
+            const R lo0 = __builtin_shufflevector(m[q], m[q + 1], 0, 4, 2, 6);
+            const R hi0 = __builtin_shufflevector(m[q], m[q + 1], 1, 5, 3, 7);
+            const R lo1 = __builtin_shufflevector(m[q + 2], m[q + 3], 0, 4, 2, 6);
+            const R hi1 = __builtin_shufflevector(m[q + 2], m[q + 3], 1, 5, 3, 7);
+            const R x = __builtin_shufflevector(lo0, lo1, 0, 1, 4, 5);
+            const R y = __builtin_shufflevector(hi0, hi1, 0, 1, 4, 5);
+            const R z = __builtin_shufflevector(lo0, lo1, 2, 3, 6, 7);
+            __builtin_memcpy((T*)&p.x + q, &x, sizeof(x));
+            __builtin_memcpy((T*)&p.y + q, &y, sizeof(y));
+            __builtin_memcpy((T*)&p.z + q, &z, sizeof(z));
+        }
+        return p;
+    };
+    auto larger = [](V u, V v) -> V { return u > v ? u : v; };
+    auto clipped = [](V u) -> V {
+        u = u > V(T(0)) ? u : V(T(0));
+        return u < V(T(1)) ? u : V(T(1));
+    };
+    auto box = [&](const auto& lattice, int code) -> R {
+        const T x = T((code & MASK) - HALF), y = T(((code >> BITS) & MASK) - HALF);
+        const T z = T(((code >> (2 * BITS)) & MASK) - HALF);
+        const auto& m = lattice.data[0];
+        R r = R(T(0));
+        for (int c = 0; c < 3; ++c) r[c] = m.data[c][0] * x + m.data[c][1] * y + m.data[c][2] * z;
+        return r;
+    };
+    const T* const back = (const T*)node_back.data;
+    const T* const now = (const T*)node_pos.data;
+    for (int k = first; k < last; k += W) {
+        R ra[W], rb[W], rd[W], rw[W], rwa[W], rwb[W];
+        for (int l = 0; l < W; ++l) {
+            const int pair = k + l < last ? k + l : last - 1;
+            const long long i = 3ll * segment_node.data[pair_i.data[pair]];
+            const long long j = 3ll * segment_node.data[pair_j.data[pair]];
+            const R xi = load(back + i), xj = load(back + j);
+            const R xi1 = load(back + i + 2).yzww, xj1 = load(back + j + 2).yzww;
+            const R mi = load(now + i) - xi, mj = load(now + j) - xj;
+            ra[l] = xi1 - xi;
+            rb[l] = xj1 - xj;
+            rd[l] = xj - xi;
+            rw[l] = mj - mi;
+            rwa[l] = load(now + i + 2).yzww - xi1 - mi;
+            rwb[l] = load(now + j + 2).yzww - xj1 - mj;
+            const int code = pair_image.data[pair];
+            if (PERIODIC && code != NONE) {
+                const R shift = box(lattice_back, code);
+                rd[l] += shift;
+                rw[l] += box(lattice_now, code) - shift;
+            }
+        }
+        const V3 a = transposed(ra), b = transposed(rb), d = transposed(rd), w = transposed(rw);
+        const V3 wa = transposed(rwa), wb = transposed(rwb);
+        const V least = V(T(1e-30)), aa = larger(a.dot(a), least), bb = larger(b.dot(b), least);
+        const V3 n = a.cross(b);
+        const V area2 = n.dot(n);
+        V s = clipped(d.cross(b).dot(n) / larger(area2, least));
+        s = area2 >= T(PARALLEL) * aa * bb ? s : V(T(0.5));
+        const V t = clipped((s * a.dot(b) - d.dot(b)) / bb);
+        s = clipped((t * a.dot(b) + d.dot(a)) / aa);
+        const V3 c = d + b * t - a * s, u = w - wa, v = w + wb, both = v - wa;
+        const V most = larger(larger(w.dot(w), u.dot(u)), larger(v.dot(v), both.dot(both)));
+        const V clear = __builtin_elementwise_sqrt(c.dot(c)) - __builtin_elementwise_sqrt(most);
+        for (int l = 0; l < W && k + l < last; ++l) pair_clear.data[k + l] = clear[l];
+    }
+"""
+
+
+def native_chunks(segment_count: int) -> int:
+    """Launch dimension of the native kernel."""
+    return (segment_count + CHUNK_SEGMENTS - 1) // CHUNK_SEGMENTS
+
+
+@cache
+def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: bool = False):
+    """Kernel `pair_motion`, over segments; `native`: over runs of CHUNK_SEGMENTS, for the CPU."""
+    p = precision(name)
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    largest_motion, _, _, _ = make_row_geometry(name)
+    closest_points = make_closest_points(name)
+    _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=periodic))
+    options: dict[str, Any] = {"module": module, "enable_backward": False, "grid_stride": False}
+
+    @wp.kernel(**options)
+    def pair_motion(
+        offset: wp.int32,
+        segments: wp.int32,
+        segment_node: wp.array(dtype=wp.int32),
+        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        lattice_back: wp.array(dtype=mat33),
+        lattice_now: wp.array(dtype=mat33),
+        node_back: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        pair_clear: wp.array(dtype=real),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        i = wp.tid() + offset
+        node_i = segment_node[i]
+        xi = node_back[node_i]
+        a = node_back[node_i + 1] - xi
+        move_i = node_pos[node_i] - xi
+        wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
+        for k in range(out_start[i], out_start[i + 1]):
+            node_j = segment_node[pair_j[k]]
+            xj = node_back[node_j]
+            b = node_back[node_j + 1] - xj
+            shift = image_shift(pair_image[k], lattice_back[0])
+            delta = xj - xi + shift
+            move_j = node_pos[node_j] - xj
+            w = move_j - move_i
+            if wp.static(periodic):
+                w += image_shift(pair_image[k], lattice_now[0]) - shift
+            wb = node_pos[node_j + 1] - node_back[node_j + 1] - move_j
+            st = closest_points(delta, a, b)
+            distance = wp.length(delta + st[1] * b - st[0] * a)
+            pair_clear[k] = distance - largest_motion(w, wa, wb)
+
+    if not native:
+        return pair_motion
+
+    text = BLOCK
+    for key, value in {
+        "MASK": (1 << IMAGE_BITS) - 1,
+        "HALF": 1 << (IMAGE_BITS - 1),
+        "BITS": IMAGE_BITS,
+        "PERIODIC": str(periodic).lower(),
+        "NONE": NO_IMAGE,
+        "PARALLEL": repr(PARALLEL),
+    }.items():
+        text = text.replace(key, str(value))
+
+    @wp.func_native(lane_types(name) + text)
+    def motion_block(
+        first: wp.int32,
+        last: wp.int32,
+        segment_node: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        lattice_back: wp.array(dtype=mat33),
+        lattice_now: wp.array(dtype=mat33),
+        node_back: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        pair_clear: wp.array(dtype=real),
+    ): ...
+
+    @wp.kernel(**options)
+    def native_pair_motion(
+        offset: wp.int32,
+        segments: wp.int32,
+        segment_node: wp.array(dtype=wp.int32),
+        out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        lattice_back: wp.array(dtype=mat33),
+        lattice_now: wp.array(dtype=mat33),
+        node_back: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        pair_clear: wp.array(dtype=real),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        begin = (wp.tid() + offset) * wp.static(CHUNK_SEGMENTS)
+        motion_block(
+            out_start[begin],
+            out_start[wp.min(begin + wp.static(CHUNK_SEGMENTS), segments)],
+            segment_node,
+            pair_i,
+            pair_j,
+            pair_image,
+            lattice_back,
+            lattice_now,
+            node_back,
+            node_pos,
+            pair_clear,
+        )
+
+    return native_pair_motion
