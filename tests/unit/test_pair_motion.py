@@ -43,7 +43,7 @@ def stepped(meeting: Meeting, request: pytest.FixtureRequest) -> Simulation:
 def cleared(sim: Simulation, native: bool) -> np.ndarray:
     """What the pairs of the list stay apart by, between the last two positions."""
     rows = contact_rows(sim)
-    model, launch = sim.model, rows._motion()
+    model, launch = sim.model, rows._motion(sim.state.node_pos, rows.pair_clear)
     kernel = make_pair_motion(model.precision.name, True, native=native)
     dim = launch.dim if native else model.segment_count
     rows.pair_clear.fill_(np.nan)
