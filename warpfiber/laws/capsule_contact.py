@@ -23,6 +23,7 @@ from warpfiber.model import precision
 LINE_COSINE = math.cos(math.radians(30.0))  # fibers at wider angles touch at a point
 LINE_PART = 0.25  # of a segment: shorter half patches are points
 SMALLEST_SINE = 0.02
+SLENDER, POWER = 0.0684, 1.531  # exponents of F_2
 
 
 @cache
@@ -34,7 +35,7 @@ def make_capsule_contact(name):
     tiny, far_away = real(1.0e-30), real(1.0e30)
     third, quarter, ninth = real(1.0 / 3.0), real(0.25), real(1.0 / 9.0)
     outermost = real(math.sqrt(0.6))  # of three Gauss points
-    slender, power = real(0.0684), real(1.531)
+    slender, power = real(SLENDER), real(POWER)
 
     @wp.func
     def curvatures(ends: wp.int32, ka: real, kb: real, sine: real) -> vec2:
@@ -52,7 +53,9 @@ def make_capsule_contact(name):
     def hertz_factor(sp: vec2) -> real:
         """sqrt(R*) F_2^-1.5."""
         difference = wp.sqrt(wp.max(sp[0] * sp[0] - real(4.0) * sp[1], zero))
-        slope = wp.pow((sp[0] + difference) / (sp[0] - difference), slender) - one
+        # (S + D) / (S - D) without the difference of numbers that are nearly equal
+        ratio = (sp[0] + difference) * (sp[0] + difference) / (real(4.0) * sp[1])
+        slope = wp.pow(ratio, slender) - one
         correction = one
         if slope > zero:
             correction = one - wp.pow(slope, power)
@@ -149,13 +152,19 @@ def make_capsule_contact(name):
         return vec4(integral, center, w1, depth)
 
     @wp.func
-    def line_depth(d0: vec3, d1: vec3, reach: real) -> real:
-        """Deepest overlap along a and as far again beyond it at both ends.
+    def line_depth(d0: vec3, d1: vec3, reach: real, t0: real, t1: real, ratio: real) -> real:
+        """Deepest overlap along both segments and a mean length beyond them at both ends.
 
-        The same for neighbors that share a patch, whatever part of it is theirs.
+        The same for neighbors that share a patch, whatever part of it is theirs. t0, t1: parts of b
+        beside the ends of a; ratio: length of b over that of a.
         """
         dv = d1 - d0
-        u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), -one, two)
+        begin = -t0 / (t1 - t0)
+        end = (one - t0) / (t1 - t0)
+        beyond = half * (one + ratio)
+        low = wp.min(zero, wp.min(begin, end)) - beyond
+        high = wp.max(one, wp.max(begin, end)) + beyond
+        u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), low, high)
         return reach - wp.length(d0 + u * dv)
 
     return curvatures, hertz_factor, side_by_side, line_overlap, line_depth, line_square
