@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODEL",
         help="folgar_tucker, rsc, iard (these by default), pard, mrd; may be repeated",
     )
-    fit.add_argument("--closure", default="IBOF", help="as in fiberoripy (default IBOF)")
+    fit.add_argument("--closure", default="IBOF", help="as in fiberoripy (default IBOF), or NONE")
     fit.add_argument("--weighting", default="length", help="length (default) or number")
     fit.add_argument("--from", type=float, dest="low", metavar="S", help="first strain")
     fit.add_argument("--to", type=float, dest="high", metavar="S", help="last strain")

@@ -85,8 +85,8 @@ def test_the_plate_moves_by_its_load(precision: str, wall: str) -> None:
         assert row["pressure_load"] == pytest.approx(rate * sim.time, rel=1e-9)
         assert push_of(sim, 1 - side) == 0.0
     assert math.copysign(1.0, moved) == (-1.0 if side else 1.0)
-    assert errors[1] < 1e-3
-    assert errors[0] > 3.0 * errors[1] or errors[1] < 1e-6
+    assert errors[0] > 3.0 * errors[1]
+    assert errors[1] < 4e-5  # measured 1.9e-5; a load that is one step late has 8e-5
 
 
 def test_an_elastic_column() -> None:

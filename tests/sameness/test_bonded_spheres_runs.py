@@ -186,7 +186,7 @@ def test_resumed_job(tmp_path: Path) -> None:
     assert 0.03 < whole.simulation.time < 2.0
     # still for 0.01 s, and no step longer than that
     method: Any = whole.simulation.method
-    assert method.still_steps.numpy().min() == method.still_needed
+    assert method.still_steps.numpy().min() == method.bed.still_needed
     job = wf.Job.start(scene, out=tmp_path / "parts")
 
     class Stop:

@@ -223,6 +223,7 @@ def test_fit_writes_its_files(shell: Shell) -> None:
     [
         (("--model", "jeffery"), "folgar_tucker, rsc, iard"),
         (("--closure", "ibof"), "IBOF"),
+        (("--closure", "NONE"), "only --model folgar_tucker"),
         (("--weighting", "volume"), "length, number"),
         (("--from", "11.5"), "rows of orientation there"),
         (("--from", "8", "--to", "3"), "0 rows of orientation there"),

@@ -23,6 +23,7 @@ from warpfiber.model import precision
 LINE_COSINE = math.cos(math.radians(30.0))  # fibers at wider angles touch at a point
 LINE_PART = 0.25  # of a segment: shorter half patches are points
 SMALLEST_SINE = 0.02
+SLENDER, POWER = 0.0684, 1.531  # exponents of F_2
 
 
 @cache
@@ -34,7 +35,7 @@ def make_capsule_contact(name):
     tiny, far_away = real(1.0e-30), real(1.0e30)
     third, quarter, ninth = real(1.0 / 3.0), real(0.25), real(1.0 / 9.0)
     outermost = real(math.sqrt(0.6))  # of three Gauss points
-    slender, power = real(0.0684), real(1.531)
+    slender, power = real(SLENDER), real(POWER)
 
     @wp.func
     def curvatures(ends: wp.int32, ka: real, kb: real, sine: real) -> vec2:
@@ -52,7 +53,9 @@ def make_capsule_contact(name):
     def hertz_factor(sp: vec2) -> real:
         """sqrt(R*) F_2^-1.5."""
         difference = wp.sqrt(wp.max(sp[0] * sp[0] - real(4.0) * sp[1], zero))
-        slope = wp.pow((sp[0] + difference) / (sp[0] - difference), slender) - one
+        # (S + D) / (S - D) without the difference of numbers that are nearly equal
+        ratio = (sp[0] + difference) * (sp[0] + difference) / (real(4.0) * sp[1])
+        slope = wp.pow(ratio, slender) - one
         correction = one
         if slope > zero:
             correction = one - wp.pow(slope, power)

@@ -24,7 +24,13 @@ class BondedContacts:
     """Neighbor list and pair arrays of one run."""
 
     def __init__(
-        self, scene: Scene, model: Model, state: State, workers: int, stretch: float
+        self,
+        scene: Scene,
+        model: Model,
+        state: State,
+        workers: int,
+        stretch: float,
+        pair_cost: float,
     ) -> None:
         self.model, self.state = model, state
         self.features = CapsuleFeatures(
@@ -34,7 +40,15 @@ class BondedContacts:
         )
         self.measured = PairFeatures(repulsion=False, periodic=self.features.periodic)
         reach = 2.0 * max(row["radius"] for row in model.group_rows)
-        self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
+        self.search = PairSearch(
+            scene,
+            model,
+            state,
+            reach=reach,
+            stretch=stretch,
+            workers=workers,
+            pair_cost=pair_cost,
+        )
         self._allocate()
 
     def _allocate(self) -> None:

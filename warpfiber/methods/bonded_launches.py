@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -12,10 +11,6 @@ from warpfiber.passes.bonds import make_bond_sweep
 from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
-from warpfiber.passes.joined_steps import JoinedSteps
-from warpfiber.passes.native_bonds import make_native_bond_sweep
-from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
-from warpfiber.passes.native_nodes import fiber_blocks
 
 REACH_MARGIN = 1.0 + 1e-5  # the reach of a pair is summed on the device
 
@@ -143,100 +138,3 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     ]
     kernel = make_bond_sweep(p.name, spheres.features, drifts, kicks)
     return Launch("bonds", kernel, model.fiber_count, inputs, split=True)
-
-
-class NativeBonds:
-    """The SIMD sweep over bonds with its blocks of fibers, and what it knows of walls."""
-
-    def __init__(self, spheres: BondedSpheres) -> None:
-        self.spheres = spheres
-        model, features = spheres.model, spheres.features
-        p, device = model.precision, model.device
-        fibers, own = fiber_blocks(model.host["fiber_group"], LANES)
-        self.block_fiber = wp.array(fibers.ravel(), dtype=wp.int32, device=device)
-        self.block_own = wp.array(own, dtype=wp.int32, device=device)
-        nodes = model.node_count if any(features.walls) else 0
-        self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)
-        self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
-        self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
-
-    def launch(self, phase: int) -> Launch:
-        """What `phase` says: sums of LOADS, END and BEGIN."""
-        spheres, contacts = self.spheres, self.spheres.contacts
-        model, state, p = spheres.model, spheres.state, spheres.model.precision
-        assert contacts is not None
-        pairs = contacts.search.list
-        inputs = [
-            wp.int32(phase),
-            p.real(spheres.dt),
-            spheres.press.place,
-            spheres.press.velocity,
-            spheres.press.fiber_push,
-            p.real(spheres.scene.contact.damping),
-            p.real(spheres.scene.contact.wall_friction),
-            spheres.wall_memory,
-            spheres.wall_depth,
-            pairs.skin_out,
-            spheres.stage,
-            spheres.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            spheres.bond_axis,
-            spheres.bond_length,
-            spheres.holds.hold,
-            spheres.holds.load,
-            spheres.grips.node_grip,
-            pairs.out_start,
-            pairs.in_start,
-            pairs.in_pair,
-            pairs.pair_i,
-            pairs.pair_j,
-            contacts.acts,
-            contacts.force,
-            contacts.moment,
-            contacts.arms,
-            self.touches,
-            self.push,
-            self.couple,
-            state.list_pos,
-            spheres.place,
-            state.node_pos,
-            state.node_velocity,
-            spheres.node_turn,
-            spheres.node_spin,
-            spheres.node_rate,
-            spheres.node_spin_rate,
-            spheres.still_steps,
-            state.status,
-            self.block_fiber,
-            self.block_own,
-        ]
-        kernel = make_native_bond_sweep(p.name, spheres.features)
-        return Launch("bonds", kernel, self.block_own.shape[0], inputs, split=True)
-
-    def kernels(self) -> list[Any]:
-        """What a step launches."""
-        launches = [clock_launch(self.spheres), pair_launch(self.spheres, 0.0)]
-        launches += [self.launch(0), *self.spheres.press.motion(), *self.spheres.press.meter()]
-        launches += [*self.spheres.grips.meter(), *self.spheres.energies.losses()]
-        return [launch.kernel for launch in launches]
-
-    def steps(self, halted: Callable[[], bool]) -> JoinedSteps:
-        """Clock, drift; pairs and bonds with the drift of the next step; pairs, bonds, kick.
-
-        What a step dissipates is found at its end, which is then a launch of its own.
-        """
-        spheres = self.spheres
-        clock, pairs = clock_launch(spheres), pair_launch(spheres, spheres.dt)
-        motion = spheres.press.motion()
-        meter = [*spheres.press.meter(), *spheres.grips.meter(), *spheres.energies.losses()]
-        drift = self.launch(BEGIN)
-        drift.name = "drift"
-        middle = [pairs, clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
-        end = [pairs, self.launch(LOADS | END), *meter]
-        if spheres.energies.told:
-            middle = [*end, clock, *motion, drift]
-        model = spheres.model
-        return JoinedSteps(
-            [clock, *motion, drift], middle, end, model.device, spheres.workers, halted
-        )

@@ -12,6 +12,7 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import (
-    NativeBonds,
     bond_launch,
     clock_launch,
     drift_launch,
@@ -30,12 +30,15 @@ from warpfiber.methods.bonded_launches import (
 )
 from warpfiber.methods.energies import Energies
 from warpfiber.methods.method import Method
+from warpfiber.methods.native_bonds import NativeBonds
+from warpfiber.methods.pair_search import STEP_PAIR_COST
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
 from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
@@ -98,14 +101,17 @@ class BondedSpheres(Method):
         self.place = state.node_pos
         if p.name == "float32":
             self.place = wp.zeros(nodes, dtype=wp.vec3d, device=device)
+        vectors = NATIVE and native_bonds_apply(model, self.features)
         self.contacts: BondedContacts | None = None
         if self.features.pairs:
             stretch = float(self._segment_stretch().max())
-            self.contacts = BondedContacts(scene, model, state, self.workers, stretch)
+            self.contacts = BondedContacts(
+                scene, model, state, self.workers, stretch, PAIR_COST if vectors else STEP_PAIR_COST
+            )
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured
         self.native: NativeBonds | None = None
-        if NATIVE and native_bonds_apply(model, self.features):
+        if vectors:
             self.native = NativeBonds(self)
         self.energies = Energies(self)
 
@@ -189,10 +195,13 @@ class BondedSpheres(Method):
             self.place.assign(self.state.node_pos.numpy().astype(float))
         first: list[Launch | Call | Repeat] = [self._rates()]
         if self.contacts is not None:
-            if self.contacts.build(self.step_count):
+            replaced = self.contacts.build(self.step_count)
+            self._find_near()
+            if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            first = [pair_launch(self, 0.0), self._rates()]
+            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
+            first = [pairs(0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
@@ -200,7 +209,7 @@ class BondedSpheres(Method):
     def _prepare_steps(self, kernels: list[Any]) -> None:
         if self.executor is None and self.native is not None:
             load_kernels([*self.native.kernels(), *kernels], self.model.device)
-            self.executor = self.native.steps(self._halted)
+            self.executor = self.native.steps()
         super().prepare(kernels)
 
     def _rates(self) -> Launch:
@@ -214,9 +223,12 @@ class BondedSpheres(Method):
         status = self._status()
         if status[TORN]:
             return False
+        if status[EXPIRED] and self.native is not None and self.native.near.lasts():
+            self.native.near.find()
+            status[EXPIRED] = 0
         if status[EXPIRED] and self.contacts is not None:
             replaced = self.contacts.expire(self.step_count)
-            if replaced is None:
+            if replaced is None or not self._find_near():
                 remedy = "fibers move farther in one step than any skin; give a smaller dt"
                 raise SceneError([Fault(self.scene.path, "numerics.dt", None, remedy)])
             if replaced:
@@ -224,9 +236,22 @@ class BondedSpheres(Method):
             self.list_seconds = self.contacts.search.seconds
         return True
 
+    def _find_near(self) -> bool:
+        """Near pairs of a new list; False if they do not last a step."""
+        if self.native is None:
+            return True
+        near = self.native.near
+        lasting = near.lasts() or near.lasts_a_step()
+        near.find()
+        return lasting
+
     def rebuild_list(self) -> None:
         """List the pairs of the present positions: some node was set elsewhere."""
-        if self.contacts is not None and self.contacts.build(self.step_count):
+        if self.contacts is None:
+            return
+        replaced = self.contacts.build(self.step_count)
+        self._find_near()
+        if replaced:
             self._stop_executor()
 
     def list_report(self) -> dict[str, float]:
@@ -238,6 +263,8 @@ class BondedSpheres(Method):
         super().close()
         if self.contacts is not None:
             self.contacts.search.close()
+        if self.native is not None:
+            self.native.near.close()
 
     # -- stages -----------------------------------------------------------------------------------
 
@@ -293,6 +320,8 @@ class BondedSpheres(Method):
         """Stress-free shape, turns, spins and accelerations of the nodes."""
         arrays = {f"bonds_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
         arrays |= self.bed.saved() | self.energies.saved()
+        if self.native is not None:
+            arrays |= self.native.near.saved()
         return arrays | (self.contacts.saved() if self.contacts is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -304,6 +333,8 @@ class BondedSpheres(Method):
         self.started = True
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
+            if self.native is not None:
+                self.native.near.restore(arrays)
             self._stop_executor()
 
     def torn_fiber(self) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 Least squares of all six components of A over the rows of a run, from several starts: the bounds are
 scanned on a grid, and the best node of every block of it is refined. The models and closures are
-those of fiberoripy; the first row is the start of their integration.
+those of fiberoripy; the first row is the start of their integration. Folgar-Tucker also goes
+without a closure (`closure_free`).
 
 Source: confidence from (J^T J)^-1 s^2 with Student's t; residuals of neighboring rows of one run
     are alike, so s^2 is multiplied, and the degrees of freedom divided, by 1 + 2 sum of their
@@ -18,13 +19,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from warpfiber.output.closure_free import LEAST_DIFFUSION, Diffusion
 from warpfiber.output.orientation_curve import INDEX, OrientationCurve
+from warpfiber.placement.without_contact import split_gradient
 from warpfiber.scene import Fault, SceneError
 
 Floats = NDArray[np.float64]
@@ -33,7 +36,7 @@ Rate = Callable[..., Floats]
 NODES = 4
 """Values of a parameter in the scan of its bounds."""
 ALIKE = 0.01
-"""Relative difference of chi^2 below which two starts found the same minimum."""
+"""Difference of chi^2, relative or of one value, below which starts found the same minimum."""
 FEWEST_ROWS = 8
 MOST_ROWS = 61
 """Rows of a curve that are fitted, evenly spaced in strain; more would only be more alike."""
@@ -92,7 +95,9 @@ MODELS: Mapping[str, OrientationModel] = {
         (DIFFUSION, Parameter("D_2", "D2", 0.0, 1.5), Parameter("D_3", "D3", 0.0, 1.5)),
     ),
 }
-CLOSURES = ("IBOF", "ORF", "ORW", "ORW3", "HYBRID", "QUADRATIC", "LINEAR")
+CLOSURE_FREE = "NONE"
+"""Folgar-Tucker alone, from the distribution of directions itself."""
+CLOSURES = (CLOSURE_FREE, "IBOF", "ORF", "ORW", "ORW3", "HYBRID", "QUADRATIC", "LINEAR")
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ class Fitted:
     @property
     def agreeing(self) -> int:
         """Number of starts that ended at the best minimum."""
-        return sum(chi2 <= self.chi2 * (1.0 + ALIKE) for _, chi2 in self.starts)
+        return sum(chi2 <= self.chi2 * (1.0 + ALIKE) + ALIKE for _, chi2 in self.starts)
 
 
 def selected(curve: OrientationCurve, low: float | None, high: float | None) -> OrientationCurve:
@@ -160,11 +165,14 @@ def fit_model(curve: OrientationCurve, model: str, closure: str, noise: float) -
     from scipy.optimize import least_squares
 
     parameters = MODELS[model].parameters
+    if closure == CLOSURE_FREE:
+        parameters = (replace(DIFFUSION, low=LEAST_DIFFUSION),)
     low, high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
+    tensors = integrator(curve, model, closure)
 
     def residuals(values: Floats) -> Floats:
         """Of sets of constants (P, p), (P, 6 (T - 1))."""
-        tensor = model_tensors(curve, model, closure, values)
+        tensor = tensors(values)
         return _components(tensor[:, 1:] - curve.tensor[1:]) / noise
 
     def slope(values: Floats) -> Floats:
@@ -206,44 +214,49 @@ def fit_model(curve: OrientationCurve, model: str, closure: str, noise: float) -
             (dict(zip(names, map(float, r.x), strict=True)), 2.0 * float(r.cost) / count)
             for r in found
         ),
-        model_tensors(curve, model, closure, best.x[None])[0],
+        tensors(best.x[None])[0],
     )
 
 
-def model_tensors(curve: OrientationCurve, model: str, closure: str, values: Floats) -> Floats:
-    """A (P, T, 3, 3) of a model with sets of constants (P, p), from the first tensor of a curve.
+def integrator(curve: OrientationCurve, model: str, closure: str) -> Callable[[Floats], Floats]:
+    """Function of sets of constants (P, p): A (P, T, 3, 3) of a model, from a curve's first tensor.
 
     All sets are integrated at once: most of the time goes into the closure, which takes them
     together. Where the integration breaks down A is far off, and no least squares goes there.
     """
+    if closure == CLOSURE_FREE:
+        free = Diffusion(curve.tensor[0], curve.gradient, curve.shape_factor)
+        return lambda values: np.array([free.tensors(row[0], curve.strain) for row in values])
     from fiberoripy import closures, orientation
     from scipy.integrate import solve_ivp
 
     ode: Rate = getattr(orientation, MODELS[model].ode)
     keywords = [p.keyword for p in MODELS[model].parameters]
-    constants = [dict(zip(keywords, row, strict=True), xi=curve.shape_factor) for row in values]
-    stretch = 0.5 * (curve.gradient + curve.gradient.T)
-    spin = 0.5 * (curve.gradient - curve.gradient.T)
+    spin, stretch = split_gradient(curve.gradient)
 
-    def rate(_: float, state: Floats) -> Floats:
-        a = np.clip(state.reshape(-1, 3, 3), -1.0, 1.0)
-        a4 = closures.compute_closure(a, closure=closure)
-        pairs = zip(a, a4, constants, strict=True)
-        return np.ravel([ode(one, four, stretch, spin, **own) for one, four, own in pairs])
+    def tensors(values: Floats) -> Floats:
+        own = [dict(zip(keywords, row, strict=True), xi=curve.shape_factor) for row in values]
 
-    count, rows = len(values), len(curve.strain)
-    answer = solve_ivp(
-        rate,
-        (curve.strain[0], curve.strain[-1]),
-        np.tile(curve.tensor[0].ravel(), count),
-        t_eval=curve.strain,
-        rtol=ACCURACY,
-        atol=1e-1 * ACCURACY,
-    )
-    tensor = np.ones((count, rows, 3, 3))
-    solved = answer.y.T.reshape(-1, count, 3, 3).swapaxes(0, 1)
-    tensor[:, : solved.shape[1]] = np.where(np.isfinite(solved), solved, 1.0)
-    return tensor
+        def rate(_: float, state: Floats) -> Floats:
+            a = np.clip(state.reshape(-1, 3, 3), -1.0, 1.0)
+            sets = zip(a, closures.compute_closure(a, closure=closure), own, strict=True)
+            return np.ravel([ode(a2, a4, stretch, spin, **constants) for a2, a4, constants in sets])
+
+        count, rows = len(values), len(curve.strain)
+        answer = solve_ivp(
+            rate,
+            (curve.strain[0], curve.strain[-1]),
+            np.tile(curve.tensor[0].ravel(), count),
+            t_eval=curve.strain,
+            rtol=ACCURACY,
+            atol=1e-1 * ACCURACY,
+        )
+        tensor = np.ones((count, rows, 3, 3))
+        solved = answer.y.T.reshape(-1, count, 3, 3).swapaxes(0, 1)
+        tensor[:, : solved.shape[1]] = np.where(np.isfinite(solved), solved, 1.0)
+        return tensor
+
+    return tensors
 
 
 def correlated_rows(residual: Floats) -> float:

@@ -17,7 +17,16 @@ import numpy as np
 
 from warpfiber.output.axes_style import GRAY, INK, plain_axes
 from warpfiber.output.cell_picture import AXIS_COLORS
-from warpfiber.output.fit import CLOSURES, CONFIDENCE, MODELS, Estimate, Fitted, fit_model, selected
+from warpfiber.output.fit import (
+    CLOSURE_FREE,
+    CLOSURES,
+    CONFIDENCE,
+    MODELS,
+    Estimate,
+    Fitted,
+    fit_model,
+    selected,
+)
 from warpfiber.output.folder import ResultFolder
 from warpfiber.output.orientation_curve import (
     INDEX,
@@ -114,6 +123,9 @@ def _check_words(models: Sequence[str], closure: str, weighting: str) -> None:
         for key, word, known in asked
         if word not in known
     ]
+    if closure == CLOSURE_FREE and set(models) - {"folgar_tucker"}:
+        remedy = "only --model folgar_tucker is known without a closure"
+        faults.append(Fault("command line", "--closure", closure, remedy))
     if faults or not models:
         raise SceneError(faults or [Fault("command line", "--model", None, "name at least one")])
 

@@ -22,17 +22,16 @@ from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import BondFeatures
 from warpfiber.passes.native_bonds_source import END, LANES, LOADS, bond_sweep_source
-from warpfiber.passes.node_walls import SIDES, make_node_walls
+from warpfiber.passes.node_walls import make_node_walls
 
 LEAST_NODES, MOST_NODES = LANES, 256
 # A block costs about as much as this many fibers of the plain sweep.
 FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    list_sizes stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
-    node_grip out_start in_start in_pair pair_i pair_j pair_acts pair_force pair_moment pair_arms
-    node_touches node_push node_couple list_pos place node_pos node_velocity node_turn node_spin
-    node_rate node_spin_rate still_steps status block_fiber block_own
+    near_skin stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
+    node_grip contact_load node_touches node_push node_couple near_pos place node_pos node_velocity
+    node_turn node_spin node_rate node_spin_rate still_steps status block_fiber block_own
 """.split()
 
 
@@ -59,7 +58,6 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
     Node = node_struct(name)
     wall_loads = make_node_walls(name, features.walls, features.wall_friction, features.press)
     has_walls, is_metered = any(features.walls), features.press >= 0
-    has_friction = features.wall_friction
     wall_x, wall_y, wall_z = features.walls
     zero = real(0.0)
 
@@ -68,7 +66,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         block: wp.int32,
         phase: wp.int32,
         dt: real,
-        list_sizes: wp.array(dtype=real),
+        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -78,19 +76,11 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
-        out_start: wp.array(dtype=wp.int32),
-        in_start: wp.array(dtype=wp.int32),
-        in_pair: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
-        pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
-        pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
-        pair_arms: wp.array(dtype=vec4),
+        contact_load: wp.array(dtype=real),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        list_pos: wp.array(dtype=vec3),
+        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -105,14 +95,8 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
     ): ...
 
     @wp.func
-    def is_at_wall(
-        g: BondGroup,
-        i: wp.int32,
-        x: wp.vec3d,
-        wall_place: wp.array(dtype=wp.vec3d),
-        wall_depth: wp.array(dtype=real),
-    ) -> wp.bool:
-        """Whether a node touches a wall or has just ceased to."""
+    def is_at_wall(g: BondGroup, x: wp.vec3d, wall_place: wp.array(dtype=wp.vec3d)) -> wp.bool:
+        """Whether a node touches a wall."""
         reach = wp.float64(g.radius)
         for axis in range(3):
             has_wall = wp.static(wall_x)
@@ -123,10 +107,6 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             if has_wall:
                 if x[axis] - wall_place[0][axis] < reach or wall_place[1][axis] - x[axis] < reach:
                     return True
-                if wp.static(has_friction):
-                    slot = wp.static(SIDES) * i + 2 * axis
-                    if wall_depth[slot] != zero or wall_depth[slot + 1] != zero:
-                        return True
         return False
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -141,7 +121,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         wall_friction: real,
         wall_memory: wp.array(dtype=vec3),
         wall_depth: wp.array(dtype=real),
-        list_sizes: wp.array(dtype=real),
+        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -151,19 +131,11 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
-        out_start: wp.array(dtype=wp.int32),
-        in_start: wp.array(dtype=wp.int32),
-        in_pair: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
-        pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
-        pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
-        pair_arms: wp.array(dtype=vec4),
+        contact_load: wp.array(dtype=real),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        list_pos: wp.array(dtype=vec3),
+        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -191,10 +163,11 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     last = fiber_node_start[fiber + 1] - 1
                     pushed = wp.vec2d()
                     for i in range(first, last + 1):
-                        touches = is_at_wall(g, i, place[i], wall_place, wall_depth)
-                        node_touches[i] = wp.uint8(touches)
-                        if not touches:
+                        touches = is_at_wall(g, place[i], wall_place)
+                        # a node that has just left a wall has a memory to be cleared
+                        if not touches and node_touches[i] == wp.uint8(0):
                             continue
+                        node_touches[i] = wp.uint8(touches)
                         node = Node()
                         node.x = place[i]
                         node.v = node_velocity[i]
@@ -225,7 +198,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             block,
             phase,
             dt,
-            list_sizes,
+            near_skin,
             stage,
             groups,
             fiber_node_start,
@@ -235,19 +208,11 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             node_hold,
             node_load,
             node_grip,
-            out_start,
-            in_start,
-            in_pair,
-            pair_i,
-            pair_j,
-            pair_acts,
-            pair_force,
-            pair_moment,
-            pair_arms,
+            contact_load,
             node_touches,
             node_push,
             node_couple,
-            list_pos,
+            near_pos,
             place,
             node_pos_out,
             node_velocity,

@@ -12,11 +12,11 @@ import math
 from warpfiber.laws.rotation import LARGEST_HALF_ANGLE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
-from warpfiber.passes.native import lane_types, transfers
+from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
+from warpfiber.passes.native_capsules_source import LINE, PARTS
 
 LANES = 8  # fibers, in both precisions
-
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
 
@@ -49,6 +49,8 @@ def _constants(features: BondFeatures) -> str:
         "IS_FREE": FREE,
         "IS_CLAMPED": CLAMPED,
         "IS_LOWER": LOWER,
+        "LINE": LINE,
+        "PARTS": PARTS,
         "LOADS": LOADS,
         "END": END,
         "BEGIN": BEGIN,
@@ -57,37 +59,25 @@ def _constants(features: BondFeatures) -> str:
     return "\n".join(lines)
 
 
-# Loads of pairs, fiber by fiber: few nodes have any.
+# Loads of contacts: the parts of the pair sweep in turn, cleared for the next one.
 _GATHER = """
-    for (int c = 0; c < 3 * nodes; ++c) a[c] = b[c] = V(T(0));
-    if constexpr (HAS_PAIRS) {
-        auto add = [&](int l, int k, int segment, T sign, T share, T arm) {
-            T* to_a = (T*)(a + 3 * segment) + l;
-            T* to_b = (T*)(b + 3 * segment) + l;
-            const T* force = (const T*)pair_force + 3 * k;
-            const T* moment = (const T*)pair_moment + 3 * k;
-            #pragma unroll
-            for (int c = 0; c < 3; ++c) {
-                const T push = sign * force[c], couple = arm * moment[c];
-                const T second_push = share * push, second_couple = share * couple;
-                to_a[c * W] += push - second_push;
-                to_a[(3 + c) * W] += second_push;
-                to_b[c * W] += couple - second_couple;
-                to_b[(3 + c) * W] += second_couple;
-            }
-        };
-        const T* arms = (const T*)pair_arms;
-        for (int l = 0; l < own; ++l) {
-            const int begin = first[l] - fiber[l];
-            const int end = begin + segments;
-            for (int k = out_start[begin]; k < out_start[end]; ++k)
-                if (pair_acts[k])
-                    add(l, k, pair_i[k] - begin, T(1), arms[4 * k], arms[4 * k + 2]);
-            for (int slot = in_start[begin]; slot < in_start[end]; ++slot) {
-                const int k = in_pair[slot];
-                if (pair_acts[k])
-                    add(l, k, pair_j[k] - begin, T(-1), arms[4 * k + 1], arms[4 * k + 3]);
-            }
+    const long part = (long)LINE * node_count;
+    for (int k = 0; k < nodes; ++k) {
+        V r[W];
+        #pragma unroll
+        for (int l = 0; l < W; ++l) {
+            const T* from = contact_load + (long)LINE * (first[l] + k);
+            r[l] = *(const U*)from;
+            for (int p = 1; p < PARTS; ++p) r[l] += *(const U*)(from + p * part);
+        }
+        for (int l = 0; l < own; ++l)
+            for (int p = 0; p < PARTS; ++p)
+                *(U*)(contact_load + (long)LINE * (first[l] + k) + p * part) = V(T(0));
+        TRANSPOSE
+        #pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            a[3 * k + c] = r[c];
+            b[3 * k + c] = r[3 + c];
         }
     }
 """
@@ -150,7 +140,8 @@ _HOLD = """
 
 _MOVE = """
     const V kick = V(T(0.5) * dt);
-    V fastest2 = V(T(0)), furthest = V(T(0));
+    V fastest2 = V(T(0));
+    M expired = V(T(1)) < T(0);
     for (int k = 0; k < nodes; ++k) {
         V3 speed = get(v, k), spin = get(w, k);
         if (loads) {
@@ -195,12 +186,13 @@ _MOVE = """
             q[4 * k + 2] = vector.z * back;
             q[4 * k + 3] = scalar * back;
             if constexpr (HAS_PAIRS) {
-                const V3 now = {narrow(at.x), narrow(at.y), narrow(at.z)};
-                const V3 moved = now - get(listed, k);
+                const P3 was = get_P(near, k);
+                const V3 moved = {
+                    narrow(at.x - was.x), narrow(at.y - was.y), narrow(at.z - was.z)};
                 const V far = __builtin_elementwise_sqrt(moved.dot(moved))
                     + dt * __builtin_elementwise_sqrt(speed.dot(speed));
-                furthest = far > furthest ? far : furthest;
-                if (IS_SINGLE) put(listed, k, now);
+                expired |= ~(far <= skin[k]);
+                if (IS_SINGLE) put(listed, k, V3{narrow(at.x), narrow(at.y), narrow(at.z)});
             }
         }
         put(v, k, speed);
@@ -215,12 +207,9 @@ _STORE = """
         store_P(3, (double*)place, x);
         store_V(4, (T*)node_turn, q);
         if (IS_SINGLE && HAS_PAIRS) store_V(3, (T*)node_pos, listed);
-        if constexpr (HAS_PAIRS) {
-            const M expired = ~(furthest <= T(0.5) * list_sizes[1]);
-            if (any(expired))
-                for (int l = 0; l < own; ++l)
-                    if (expired[l]) status[SLOT_EXPIRED] = 1;
-        }
+        if (any(expired))
+            for (int l = 0; l < own; ++l)
+                if (expired[l]) status[SLOT_EXPIRED] = 1;
     } else {
         store_V(3, (T*)node_rate, a);
         store_V(3, (T*)node_spin_rate, b);
@@ -240,15 +229,17 @@ _SWEEP = """
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
     const bool loads = phase & LOADS, ends = phase & END, begins = phase & BEGIN;
 
-    P* x = (P*)__builtin_alloca_with_align(3 * nodes * sizeof(P), 512);
-    V* v = (V*)__builtin_alloca_with_align(23 * nodes * sizeof(V), 512);
+    P* x = (P*)__builtin_alloca_with_align(6 * nodes * sizeof(P), 512);
+    P* near = x + 3 * nodes;
+    V* v = (V*)__builtin_alloca_with_align(24 * nodes * sizeof(V), 512);
     V* w = v + 3 * nodes;
     V* q = w + 3 * nodes;
     V* a = q + 4 * nodes;
     V* b = a + 3 * nodes;
     V* axis = b + 3 * nodes;
     V* length = axis + 3 * nodes;
-    V* listed = length + nodes;
+    V* skin = length + nodes;
+    V* listed = skin + nodes;
     struct P3 { P x, y, z; };
     struct V4 { V3 v; V s; };
     auto get = [](const V* u, int k) -> V3 { return V3{u[3 * k], u[3 * k + 1], u[3 * k + 2]}; };
@@ -270,7 +261,10 @@ _LOAD = """
     load_V(3, v, (const T*)node_velocity);
     load_V(4, q, (const T*)node_turn);
     load_V(3, w, (const T*)node_spin);
-    if (begins && HAS_PAIRS) load_V(3, listed, (const T*)list_pos);
+    if (begins && HAS_PAIRS) {
+        load_P(3, near, (const double*)near_pos);
+        load_V(1, skin, near_skin);
+    }
     if (loads) {
         load_V(3, axis, (const T*)bond_axis);
         load_V(1, length, (const T*)bond_length);
@@ -286,13 +280,16 @@ _LOAD = """
 def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
-    work = _LOAD.replace("GATHER", _GATHER).replace("BONDS", BONDS + _RATES)
+    work = _LOAD.replace("GATHER", _GATHER.replace("TRANSPOSE", transpose(LANES))).replace(
+        "BONDS", BONDS + _RATES
+    )
     work += _MOVE.replace("HOLD", _HOLD) + _STORE
     types = lane_types(name, LANES)
     places = "auto& load_P = load_V; auto& store_P = store_V;"
     if name == "float32":
         places = transfers("P", LANES)
     return f"""
+    const int node_count = place.shape[0];
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {types}

@@ -32,10 +32,15 @@ def shape_factor(equivalent_aspect_ratio: ArrayLike) -> Floats:
     return np.asarray((square - 1.0) / (square + 1.0))
 
 
+def split_gradient(gradient: ArrayLike) -> tuple[Floats, Floats]:
+    """W and D (3, 3) of a gradient L_ij = du_i/dx_j."""
+    rate = np.asarray(gradient, dtype=np.float64)
+    return 0.5 * (rate - rate.T), 0.5 * (rate + rate.T)
+
+
 def deformations(gradient: ArrayLike, factor: ArrayLike, strain: ArrayLike) -> Floats:
     """F (T, K, 3, 3) of shape factors (K,) at strains (T,), gradient (3, 3) per unit of strain."""
-    rate = np.asarray(gradient, dtype=np.float64)
-    spin, stretch = 0.5 * (rate - rate.T), 0.5 * (rate + rate.T)
+    spin, stretch = split_gradient(gradient)
     generator = spin + np.atleast_1d(factor)[:, None, None] * stretch
     return _exponential(np.atleast_1d(strain)[:, None, None, None] * generator)
 

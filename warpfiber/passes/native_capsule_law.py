@@ -1,0 +1,209 @@
+"""C++ text of the normal contact of eight pairs of segments, one lane per pair.
+
+The law of `capsule_contact` among the other segments of the two fibers (`capsule_touch`), branches
+as masks. Powers are exponentials of logarithms, both by series to rounding.
+Symbols: as in `capsule_contact`; a, b edges of the two segments, delta from start to start, `back_`
+    and `ahead_` the edges before and after them, `tip0_`, `tip1_` lanes whose segment is the first
+    or the last one of its fiber.
+"""
+
+import math
+
+from warpfiber.laws.capsule_contact import (
+    LINE_COSINE,
+    LINE_PART,
+    POWER,
+    SLENDER,
+    SMALLEST_SINE,
+)
+from warpfiber.passes.pairs import END_TOLERANCE
+
+# Terms of log((1 + f) / (1 - f)) up to f = 3 - sqrt(8), and of exp up to half a binary digit.
+LOG_TERMS = {"float64": 11, "float32": 5}
+EXP_TERMS = {"float64": 14, "float32": 8}
+
+
+def contact_constants(name: str) -> str:
+    """Numbers of the law."""
+    numbers = {
+        "LINE_COSINE": LINE_COSINE,
+        "LINE_PART": LINE_PART,
+        "SMALLEST_SINE": SMALLEST_SINE,
+        "SLENDER": SLENDER,
+        "POWER": POWER,
+        "NEAR": END_TOLERANCE[name],
+        "TINY": 1e-30,
+        "FAR": 1e30,
+        "LN2": math.log(2.0),
+        "ROOT2": math.sqrt(2.0),
+    }
+    lines = [f"constexpr T {key} = T({value!r});" for key, value in numbers.items()]
+    logs = [2.0 / (2 * n + 1) for n in range(LOG_TERMS[name])]
+    exps = [1.0 / math.factorial(n) for n in range(EXP_TERMS[name])]
+    for key, values in (("LOG", logs), ("EXP", exps)):
+        text = ", ".join(f"T({value!r})" for value in values)
+        lines.append(f"constexpr int {key}_TERMS = {len(values)};")
+        lines.append(f"constexpr T {key}[{len(values)}] = {{{text}}};")
+    # ln 2 in two parts, the first with zeros in its last digits
+    bits = {"float64": (52, 1023, 21), "float32": (23, 127, 10)}[name]
+    high = math.floor(math.log(2.0) * 2.0 ** bits[2]) / 2.0 ** bits[2]
+    low = math.log(2.0) - high
+    if name == "float64":  # log(2) to more than 53 bits
+        low = 0.6931471805599453 - high + 2.319046813846299e-17
+    lines.append(f"constexpr T LN2_HIGH = T({high!r}), LN2_LOW = T({low!r});")
+    lines.append(f"constexpr int DIGITS = {bits[0]}, BIAS = {bits[1]};")
+    return "\n".join(lines)
+
+
+POWERS = """
+    auto root = [](V x) -> V { return __builtin_elementwise_sqrt(x); };
+    auto larger = [](V x, V y) -> V { return x > y ? x : y; };
+    auto smaller = [](V x, V y) -> V { return x < y ? x : y; };
+    auto clamp01 = [](V x) -> V {
+        x = x > T(0) ? x : V(T(0));
+        return x < T(1) ? x : V(T(1));
+    };
+    // x > 0, normal
+    auto power = [](V x, T exponent) -> V {
+        const M word = __builtin_bit_cast(M, x);
+        M e = (word >> DIGITS) - BIAS;
+        V m = __builtin_bit_cast(V, (word & ((M)1 << DIGITS) - 1) | ((M)BIAS << DIGITS));
+        const M high = m > ROOT2;
+        m = high ? m * T(0.5) : m;
+        e = e - high;  // true is -1
+        const V f = (m - T(1)) / (m + T(1)), f2 = f * f;
+        V sum = V(LOG[LOG_TERMS - 1]);
+        #pragma unroll
+        for (int n = LOG_TERMS - 2; n >= 0; --n) sum = sum * f2 + LOG[n];
+        const V digits = __builtin_convertvector(e, V);
+        const V y = exponent * (sum * f + digits * LN2);
+        constexpr T whole = T(1.5) * (T)(1ll << DIGITS);
+        const V n = (y * (T(1) / LN2) + whole) - whole;
+        const V r = (y - n * LN2_HIGH) - n * LN2_LOW;
+        V value = V(EXP[EXP_TERMS - 1]);
+        #pragma unroll
+        for (int k = EXP_TERMS - 2; k >= 0; --k) value = value * r + EXP[k];
+        const M twos = (__builtin_convertvector(n, M) + BIAS) << DIGITS;
+        return value * __builtin_bit_cast(V, twos);
+    };
+    // sqrt(R*) F_2^-1.5 of the sum and the product of the curvatures
+    auto hertz_factor = [&](V sum, V product) -> V {
+        const V difference = root(larger(sum * sum - T(4) * product, V(T(0))));
+        const V ratio = (sum + difference) * (sum + difference) / (T(4) * product);
+        const V slope = larger(power(ratio, SLENDER) - T(1), V(T(1e-15)));
+        const V correction = T(1) - power(slope, POWER);
+        return T(1) / (root(root(product)) * correction * root(correction));
+    };
+"""
+
+# Sets force, stiffness, s, t and depth of the lanes; no force where another pair has the contact.
+NORMAL = """
+    const V reach = radius_i + radius_j;
+    const V ki = T(1) / radius_i, kj = T(1) / radius_j;
+    const V modulus = T(1) / (compliance_i + compliance_j);
+    const V3 c0 = delta + b * t - a * s;
+    const V square0 = c0.dot(c0);
+    const M hit = square0 < reach * reach;
+    const V aa = a.dot(a), bb = b.dot(b), ab = a.dot(b);
+    const V la = root(aa), lb = root(bb), both = T(1) / (la * lb);
+    const V cosine = (ab < T(0) ? -ab : ab) * both;
+    const V3 normal = a.cross(b);
+    const V sine = larger(root(normal.dot(normal)) * both, V(SMALLEST_SINE));
+    const V factor0 = hertz_factor(ki + kj, ki * kj * sine * sine);
+
+    V force = V(T(0)), stiffness = V(T(0)), depth = V(T(0)), line_s = s, line_t = t;
+    M is_line = hit & (cosine > LINE_COSINE);
+    if (any(is_line)) {
+        const V3 along = b * (ab < T(0) ? V(T(-1)) : V(T(1)));
+        V3 middle = a * (T(1) / la) + along * (T(1) / lb);
+        middle = middle * (T(1) / root(middle.dot(middle)));
+        const V wa = a.dot(middle), wb = b.dot(middle), start = delta.dot(middle);
+        const V inverse_a = T(1) / wa, inverse_b = T(1) / wb;
+        const V low = larger(V(T(0)), smaller(start, start + wb)) * inverse_a;
+        const V high = smaller(wa, larger(start, start + wb)) * inverse_a;
+        const V t0 = -start * inverse_b, t1 = (wa - start) * inverse_b;
+        const V3 d0 = delta + b * t0, dv = delta + b * t1 - a - d0;
+        const V vv = dv.dot(dv), dd = d0.dot(dv), square = d0.dot(d0);
+        const V held = larger(vv, V(TINY));
+        const V closest = root(larger(square - dd * dd / held, V(T(0))));
+        const V deepest = reach - closest;
+        // overlap q - p u - e u^2, and its roots without the difference of large numbers
+        const V scale = T(1) / (reach + closest);
+        const V q = scale * (reach * reach - square), p = scale * T(2) * dd, e = scale * vv;
+        V wide = root(larger(p * p + T(4) * e * q, V(T(0))));
+        wide = p < T(0) ? -wide : wide;
+        const V u = T(-0.5) * (p + wide);
+        const V size = u < T(0) ? -u : u;
+        const V first = size > TINY ? -q / u : V(-FAR);
+        V second = u < T(0) ? V(-FAR) : V(FAR);
+        second = size < T(1e20) * e ? u / e : second;
+        const V u0 = larger(low, smaller(first, second)), u1 = smaller(high, larger(first, second));
+        const V w1 = u1 - u0, s0 = u0 * u0, s1 = u1 * u1;
+        const V w2 = T(0.5) * (s1 - s0), w3 = (s1 * u1 - s0 * u0) * T(1.0 / 3.0);
+        const V w4 = T(0.25) * (s1 * s1 - s0 * s0);
+        V integral = larger(q * w1 - p * w2 - e * w3, V(T(0)));
+        integral = ((deepest > T(0)) & (u1 > u0)) ? integral : V(T(0));
+        V center = (q * w2 - p * w3 - e * w4) / larger(integral, V(TINY));
+        center = center > u0 ? center : u0;
+        center = center < u1 ? center : u1;
+        const V patch = LINE_PART * smaller(la, lb) * sine;
+        is_line &= T(2) * reach * deepest >= patch * patch;
+        const M acts = is_line & (integral > T(0));
+        const V length = la * root(T(0.5) * (T(1) + cosine));
+        const V k = modulus * factor0 * sine * length / root(T(2) * reach);
+        V way = -dd / held;
+        way = way > T(-1) ? way : V(T(-1));
+        way = way < T(2) ? way : V(T(2));
+        const V3 there = d0 + dv * way;
+        force = acts ? k * integral : force;
+        stiffness = acts ? k * w1 : stiffness;
+        line_s = acts ? center : line_s;
+        line_t = acts ? clamp01(t0 + center * (t1 - t0)) : line_t;
+        depth = acts ? reach - root(there.dot(there)) : depth;
+    }
+
+    const M low_i = s <= NEAR, high_i = s >= T(1) - NEAR;
+    const M low_j = t <= NEAR, high_j = t >= T(1) - NEAR;
+    const M end_i = (low_i & tip0_i) | (high_i & tip1_i);
+    const M end_j = (low_j & tip0_j) | (high_j & tip1_j);
+    M reject = (high_i & ~tip1_i) | (high_j & ~tip1_j) | (is_line & ~(end_i | end_j)) | ~hit;
+    reject |= low_i & ~tip0_i & (c0.dot(back_i) < -NEAR * back_i.dot(back_i));
+    reject |= low_j & ~tip0_j & (c0.dot(back_j) > NEAR * back_j.dot(back_j));
+    if (any(~reject)) {
+        V factor = factor0;
+        if (any((end_i | end_j) & ~reject)) {
+            const V total = ki + kj;
+            V sum = end_i ? ki + total : kj + total, product = end_i ? ki * total : kj * total;
+            sum = (end_i & end_j) ? T(2) * total : sum;
+            product = (end_i & end_j) ? total * total : product;
+            factor = (end_i | end_j) ? hertz_factor(sum, product) : factor;
+        }
+        const V deep = larger(reach - root(square0), V(T(0)));
+        const V patch = root(T(2) * reach * deep) / sine, inverse = T(1) / patch;
+        // a part where the fiber comes nearer again beyond a node: 0 at the node, 1 at its start
+        auto share = [&](V far, const M& tip, const V3& vertex, const V3& from, const V3& other,
+                         V length2, const V3& onward) {
+            const M near = ~tip & (far < patch);
+            if (!any(near)) return;
+            const V part = clamp01((vertex - from).dot(other) / length2);
+            const V3 away = from + other * part - vertex;
+            const M hollow = near & (away.dot(onward) > NEAR * onward.dot(onward));
+            factor = hollow ? factor * (T(0.5) + T(0.5) * far * inverse) : factor;
+        };
+        const V3 nothing = same3(0, 0, 0);
+        share(s * la, tip0_i, nothing, delta, b, bb, nothing - back_i);
+        share((T(1) - s) * la, tip1_i, a, delta, b, bb, ahead_i);
+        share(t * lb, tip0_j, delta, nothing, a, aa, nothing - back_j);
+        share((T(1) - t) * lb, tip1_j, delta + b, nothing, a, aa, ahead_j);
+        const V k = T(2) * modulus * factor * root(deep);
+        const V push = T(2.0 / 3.0) * k * deep;
+        const M point = ~reject & ~(force >= push);
+        force = point ? push : force;
+        stiffness = point ? k : stiffness;
+        depth = point ? deep : depth;
+        line_s = point ? s : line_s;
+        line_t = point ? t : line_t;
+    }
+    s = line_s;
+    t = line_t;
+"""
