@@ -1,4 +1,4 @@
-"""Fibers in an upright cylinder: its Hertz contact, swinging and rolling inside, placement, faults."""
+"""Fibers in an upright cylinder: its contact, swinging and rolling inside, placement, faults."""
 
 from __future__ import annotations
 
