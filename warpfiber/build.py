@@ -168,6 +168,13 @@ def realized_scene(scene: Scene, placement: Placement) -> Scene:
     return dataclasses.replace(scene, fibers=tuple(groups))
 
 
+def _closing_segments(scene: Scene) -> np.ndarray:
+    """(G,) segments that close the fibers of a group and may meet others."""
+    meets = scene.contact.law != "none"
+    closed = [meets and g.shape.kind == "ring" and g.node_file is None for g in scene.fibers]
+    return np.asarray(closed, dtype=np.int32)
+
+
 def build(
     scene: Scene, device: str, placement: Placement | None = None
 ) -> tuple[Model, State, dict[str, Any]]:
@@ -181,13 +188,20 @@ def build(
     groups, pivots = device_groups(rows, p, device)
     start = np.asarray(placement.fiber_node_start, dtype=np.int32)
     fiber_count, node_count = len(start) - 1, int(start[-1])
-    segment_fiber = np.repeat(np.arange(fiber_count, dtype=np.int32), np.diff(start) - 1)
-    segment_node = (np.arange(len(segment_fiber)) + segment_fiber).astype(np.int32)
+    closed = _closing_segments(scene)[np.asarray(placement.fiber_group)]
+    counts = np.diff(start) - 1 + closed
+    segment_start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    segment_fiber = np.repeat(np.arange(fiber_count, dtype=np.int32), counts)
+    at = np.arange(len(segment_fiber)) - segment_start[segment_fiber]
+    segment_node = (start[segment_fiber] + at).astype(np.int32)
+    closing = segment_node + 1 == start[segment_fiber + 1]
+    segment_end = np.where(closing, start[segment_fiber], segment_node + 1).astype(np.int32)
     host = {
         "fiber_node_start": start,
         "fiber_group": np.asarray(placement.fiber_group, dtype=np.int32),
         "segment_fiber": segment_fiber,
         "segment_node": segment_node,
+        "segment_end": segment_end,
     }
 
     def put(values: np.ndarray, dtype: Any) -> Any:
@@ -204,7 +218,9 @@ def build(
         fiber_node_start=put(start, wp.int32),
         fiber_group=put(host["fiber_group"], wp.int32),
         segment_node=put(segment_node, wp.int32),
+        segment_end=put(segment_end if closed.any() else segment_end[:0], wp.int32),
         segment_fiber=put(segment_fiber, wp.int32),
+        fiber_segment_start=put(segment_start, wp.int32),
         fiber_count=fiber_count,
         node_count=node_count,
         segment_count=len(segment_fiber),

@@ -139,7 +139,9 @@ class Model:
     fiber_node_start: Any  # (F+1,) int32
     fiber_group: Any  # (F,) int32
     segment_node: Any  # (S,) int32: first node of a segment
+    segment_end: Any  # (S,) int32: its second node; nothing where every one is the next
     segment_fiber: Any  # (S,) int32
+    fiber_segment_start: Any  # (F+1,) int32
     fiber_count: int
     node_count: int
     segment_count: int

@@ -207,11 +207,6 @@ NOT_SPHERES: list[tuple[dict[str, object], str, str]] = [
     ({"fibers.0.poisson_ratio": 0.6}, "fibers.0.poisson_ratio", "0.5"),
     ({"fibers.0.density": GONE}, "fibers.0.density", "missing"),
     ({"fibers.0.inextensible": True}, "fibers.0.inextensible", "axial_modulus"),
-    (
-        {"contact.law": "hertz", "fibers.0.shape": {"kind": "ring"}},
-        "fibers.0.shape.kind",
-        "contacts of rings are not available",
-    ),
 ]
 
 

@@ -80,8 +80,9 @@ def contact_counts(spheres: BondedSpheres) -> Array:
     acts = spheres.contacts.acts.numpy()[: len(i)] != 0
     arms = spheres.contacts.arms.numpy()[: len(i)][acts]
     first = spheres.model.host["segment_node"]
+    end = spheres.model.host["segment_end"]
     for segment, part in ((i[acts], arms[:, 0]), (j[acts], arms[:, 1])):
-        np.add.at(found, first[segment] + (part >= 0.5), 1.0)
+        np.add.at(found, np.where(part >= 0.5, end[segment], first[segment]), 1.0)
     return found
 
 

@@ -37,8 +37,11 @@ class BondedContacts:
             periodic=any(model.domain.periodic),
             dashpot=scene.contact.damping > 0.0,
             friction=scene.contact.friction > 0.0,
+            closed=len(model.segment_end) > 0,
         )
-        self.measured = PairFeatures(repulsion=False, periodic=self.features.periodic)
+        self.measured = PairFeatures(
+            repulsion=False, periodic=self.features.periodic, closed=self.features.closed
+        )
         reach = 2.0 * max(row["radius"] for row in model.group_rows)
         self.search = PairSearch(
             scene,

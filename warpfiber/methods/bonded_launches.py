@@ -117,6 +117,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         spheres.stage,
         spheres.groups,
         model.fiber_node_start,
+        model.fiber_segment_start,
         model.fiber_group,
         spheres.bond_axis,
         spheres.bond_length,

@@ -233,7 +233,8 @@ class Method(ABC):
         first = model.host["segment_node"]
         rest = np.asarray([row["rest"] for row in model.group_rows])
         mine = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
-        lengths: np.ndarray = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1) / mine
+        end = model.host["segment_end"]
+        lengths: np.ndarray = np.linalg.norm(nodes[end] - nodes[first], axis=1) / mine
         return lengths
 
     def torn_fiber(self) -> dict[str, Any]:

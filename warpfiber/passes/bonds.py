@@ -113,6 +113,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_segment_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         bond_axis: wp.array(dtype=vec3),
         bond_length: wp.array(dtype=real),
@@ -172,6 +173,21 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 last_moment = moment_i
                 force = -pull
                 moment = moment_j
+                if wp.static(has_pairs):
+                    push, couple, push_after, couple_after = gather_pairs(
+                        fiber_segment_start[fiber] + last - first,
+                        out_start,
+                        in_start,
+                        in_pair,
+                        pair_acts,
+                        pair_force,
+                        pair_moment,
+                        pair_arms,
+                    )
+                    last_force += push
+                    last_moment += couple
+                    force += push_after
+                    moment += couple_after
                 if not (length2 < torn2):  # not finite is torn too
                     torn = 1
 
@@ -197,8 +213,11 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     torn = 1
 
                 if wp.static(has_pairs):
+                    segment = i - fiber
+                    if wp.static(has_rings):
+                        segment = fiber_segment_start[fiber] + i - first
                     push, couple, push_after, couple_after = gather_pairs(
-                        i - fiber,
+                        segment,
                         out_start,
                         in_start,
                         in_pair,

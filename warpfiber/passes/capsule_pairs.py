@@ -20,6 +20,7 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.contact_memory import make_hand_over
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
+from warpfiber.passes.ring_nodes import make_ring_nodes
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class CapsuleFeatures:
     periodic: bool = False
     dashpot: bool = False
     friction: bool = False
+    closed: bool = False  # some fibers are rings
 
 
 @cache
@@ -39,30 +41,36 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
-    normal_contact = make_capsule_touch(name, features.periodic)
-    neighbors_memory = make_hand_over(name)
+    normal_contact = make_capsule_touch(name, features.periodic, False, features.closed)
+    _, _, _, node_after, _, segment_over = make_ring_nodes(features.closed)
+    neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
     has_dashpot, has_friction = features.dashpot, features.friction
+    is_closed = features.closed
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
 
     @wp.func
+    def ring_of(g: BondGroup) -> wp.int32:
+        """Nodes of a ring, 0 of an open fiber."""
+        return g.closed * (g.segments + 1)
+
+    @wp.func
     def segment_beside(g: BondGroup, i: wp.int32, at: wp.int32, s: real) -> wp.int32:
         """The next segment over the nearer node; i itself where the fiber ends."""
-        if s < half:
-            return wp.where(at > 0, i - 1, i)
-        return wp.where(at < g.segments - 1, i + 1, i)
+        return segment_over(i, at, g.segments, ring_of(g), s >= half)
 
     @wp.func
     def node_between(
         s: real,
         node: wp.int32,
+        end: wp.int32,
         node_velocity: wp.array(dtype=vec3),
         node_spin: wp.array(dtype=vec3),
     ):
         """Velocity and spin at the part s of the segment that begins with a node."""
-        v = (one - s) * node_velocity[node] + s * node_velocity[node + 1]
-        w = (one - s) * node_spin[node] + s * node_spin[node + 1]
+        v = (one - s) * node_velocity[node] + s * node_velocity[end]
+        w = (one - s) * node_spin[node] + s * node_spin[end]
         return v, w
 
     @wp.func
@@ -114,12 +122,18 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         gi = groups[fiber_group[fiber_i]]
         at_i = node_i - fiber_node_start[fiber_i]
         xi = place[node_i]
-        a = vec3(place[node_i + 1] - xi)
+        end_i = node_after(node_i, at_i, ring_of(gi))
+        a = vec3(place[end_i] - xi)
         for k in range(out_start[i], out_start[i + 1]):
             j = pair_j[k]
             node_j = segment_node[j]
             xj = place[node_j]
-            b = vec3(place[node_j + 1] - xj)
+            end_j = node_j + 1
+            if wp.static(is_closed):
+                fiber = segment_fiber[j]
+                ring = ring_of(groups[fiber_group[fiber]])
+                end_j = node_after(node_j, node_j - fiber_node_start[fiber], ring)
+            b = vec3(place[end_j] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
@@ -151,8 +165,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             size = push[0]
             force = vec3(zero, zero, zero)
             if wp.static(has_dashpot or has_friction):
-                v_i, w_i = node_between(s, node_i, node_velocity, node_spin)
-                v_j, w_j = node_between(t, node_j, node_velocity, node_spin)
+                v_i, w_i = node_between(s, node_i, end_i, node_velocity, node_spin)
+                v_j, w_j = node_between(t, node_j, end_j, node_velocity, node_spin)
                 slip = v_i - v_j + wp.cross(arm_i * w_i + arm_j * w_j, n)
                 approach = wp.dot(slip, n)
                 mass = one / (inverse_mass(gi, at_i, s) + inverse_mass(gj, at_j, t))

@@ -14,16 +14,19 @@ from warpfiber.laws.capsule_contact import make_capsule_contact as make_contact
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
+from warpfiber.passes.ring_nodes import make_ring_minimum, make_ring_nodes
 
 
 @cache
-def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False):
+def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False, closed: bool = False):
     """`normal_contact`: (force, stiffness, s, t), depth for memories, energy if wanted."""
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=periodic)
     _, _, is_local_minimum, _ = make_pair_geometry(name, geometry)
+    is_ring_minimum = make_ring_minimum(name)
+    has_before, has_after, node_before, node_after, node_beyond, _ = make_ring_nodes(closed)
     curvatures, hertz_factor, side_by_side, line_overlap, line_depth, line_square = make_contact(
         name
     )
@@ -86,15 +89,38 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False):
                     line_energy = half * stiffness * square
 
         ends = wp.int32(0)
-        if (st[0] <= near and at_i == 0) or (st[0] >= one - near and at_i == gi.segments - 1):
+        ring_i = gi.closed * (gi.segments + 1)
+        ring_j = gj.closed * (gj.segments + 1)
+        if st[0] <= near and not has_before(at_i, ring_i):
             ends += 1
-        if (st[1] <= near and at_j == 0) or (st[1] >= one - near and at_j == gj.segments - 1):
+        elif st[0] >= one - near and not has_after(at_i, gi.segments, ring_i):
+            ends += 1
+        if st[1] <= near and not has_before(at_j, ring_j):
+            ends += 2
+        elif st[1] >= one - near and not has_after(at_j, gj.segments, ring_j):
             ends += 2
         if is_line and ends == 0:
             return line, deepest, line_energy
-        if not is_local_minimum(
-            st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
-        ):
+        is_minimum = wp.bool(False)
+        if wp.static(closed):
+            is_minimum = is_ring_minimum(
+                st,
+                c,
+                node_i,
+                at_i,
+                gi.segments,
+                ring_i,
+                node_j,
+                at_j,
+                gj.segments,
+                ring_j,
+                node_pos,
+            )
+        else:
+            is_minimum = is_local_minimum(
+                st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
+            )
+        if not is_minimum:
             return line, deepest, line_energy
         depth = wp.max(reach - wp.length(c), zero)
         factor = hertz_factor(curvatures(ends, ki, kj, sine))
@@ -143,21 +169,29 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False):
         lb = wp.length(b)
         nothing = vec3(zero, zero, zero)
         share = one
+        ring_i = gi.closed * (gi.segments + 1)
+        ring_j = gj.closed * (gj.segments + 1)
         far = st[0] * la
-        if at_i > 0 and far < patch:
-            if is_hollow(nothing, delta, b, node_pos[node_i - 1] - node_pos[node_i]):
+        if has_before(at_i, ring_i) and far < patch:
+            onward = node_pos[node_before(node_i, at_i, ring_i)] - node_pos[node_i]
+            if is_hollow(nothing, delta, b, onward):
                 share *= half + half * far / patch
         far = (one - st[0]) * la
-        if at_i < gi.segments - 1 and far < patch:
-            if is_hollow(a, delta, b, node_pos[node_i + 2] - node_pos[node_i + 1]):
+        if has_after(at_i, gi.segments, ring_i) and far < patch:
+            second = node_after(node_i, at_i, ring_i)
+            onward = node_pos[node_beyond(node_i, at_i, ring_i)] - node_pos[second]
+            if is_hollow(a, delta, b, onward):
                 share *= half + half * far / patch
         far = st[1] * lb
-        if at_j > 0 and far < patch:
-            if is_hollow(delta, nothing, a, node_pos[node_j - 1] - node_pos[node_j]):
+        if has_before(at_j, ring_j) and far < patch:
+            onward = node_pos[node_before(node_j, at_j, ring_j)] - node_pos[node_j]
+            if is_hollow(delta, nothing, a, onward):
                 share *= half + half * far / patch
         far = (one - st[1]) * lb
-        if at_j < gj.segments - 1 and far < patch:
-            if is_hollow(delta + b, nothing, a, node_pos[node_j + 2] - node_pos[node_j + 1]):
+        if has_after(at_j, gj.segments, ring_j) and far < patch:
+            second = node_after(node_j, at_j, ring_j)
+            onward = node_pos[node_beyond(node_j, at_j, ring_j)] - node_pos[second]
+            if is_hollow(delta + b, nothing, a, onward):
                 share *= half + half * far / patch
         return share
 

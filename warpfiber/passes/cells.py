@@ -38,6 +38,7 @@ class ListFeatures:
     shear_axes: tuple[int, int] | None = None
     sheared: bool = False
     pieces: bool = False
+    closed: bool = False  # segments that end at the first node of their fiber
 
 
 # Cell order is random order in memory: what the pieces after this one need is asked for early.
@@ -69,7 +70,7 @@ def make_cell_kernels(
     i_flow, i_gradient = wp.constant(flow_axis), wp.constant(gradient_axis)
     resets = features.shear_axes is not None
     sheared = features.sheared
-    pieces = features.pieces
+    pieces, closed = features.pieces, features.closed
     half = wp.float64(0.5)
     stored = wp.float32 if native else wp.vec4f
     options = {"module": module, "enable_backward": False, "grid_stride": False}
@@ -210,6 +211,7 @@ def make_cell_kernels(
         piece_segment: wp.array(dtype=wp.int32),
         piece_part: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
+        segment_end: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
         piece_wrap_out: wp.array(dtype=wp.int32),
         key_out: wp.array(dtype=wp.int32),
@@ -222,7 +224,10 @@ def make_cell_kernels(
             i = piece_segment[e]
         node = segment_node[i]
         start = wp.vec3d(node_pos[node])
-        end = wp.vec3d(node_pos[node + 1])
+        after = node + 1
+        if wp.static(closed):
+            after = segment_end[i]
+        end = wp.vec3d(node_pos[after])
         middle = half * (start + end)
         if wp.static(pieces):
             middle = start + middle_fraction(piece_part[e]) * (end - start)
@@ -252,6 +257,7 @@ def make_cell_kernels(
         piece_segment: wp.array(dtype=wp.int32),
         piece_part: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
+        segment_end: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
         geometry_out: wp.array(dtype=stored),
         start_out: wp.array(dtype=vec3),
@@ -271,7 +277,10 @@ def make_cell_kernels(
             i = piece_segment[e]
         node = segment_node[i]
         start = node_pos[node]
-        axis = node_pos[node + 1] - start
+        after = node + 1
+        if wp.static(closed):
+            after = segment_end[i]
+        axis = node_pos[after] - start
         if sizes[2] > wp.float64(0.0):
             reach = real(sizes[2]) / wp.length(axis) * axis
             start -= reach

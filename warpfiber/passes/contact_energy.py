@@ -20,6 +20,7 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
+from warpfiber.passes.ring_nodes import make_ring_nodes
 
 # Columns: normal and tangential part; of a measurement stored, of a step put in against dashpots
 # and against all tangential forces.
@@ -34,7 +35,8 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
-    normal_contact = make_capsule_touch(name, features.periodic, not is_step)
+    normal_contact = make_capsule_touch(name, features.periodic, not is_step, features.closed)
+    _, _, _, node_after, _, _ = make_ring_nodes(features.closed)
     has_friction = features.friction
     zero, half, one = real(0.0), real(0.5), real(1.0)
 
@@ -73,7 +75,8 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
         gi = groups[fiber_group[fiber_i]]
         at_i = node_i - fiber_node_start[fiber_i]
         xi = place[node_i]
-        a = vec3(place[node_i + 1] - xi)
+        end_i = node_after(node_i, at_i, gi.closed * (gi.segments + 1))
+        a = vec3(place[end_i] - xi)
         now = wp.int32(step[0])
         normal = wp.float64(0.0)
         tangential = wp.float64(0.0)
@@ -86,7 +89,8 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
             gj = groups[fiber_group[segment_fiber[j]]]
             at_j = node_j - fiber_node_start[segment_fiber[j]]
             xj = place[node_j]
-            b = vec3(place[node_j + 1] - xj)
+            end_j = node_after(node_j, at_j, gj.closed * (gj.segments + 1))
+            b = vec3(place[end_j] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
             reach = gi.radius + gj.radius
@@ -102,10 +106,10 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
                 s = arms[0]
                 t = arms[1]
                 n = wp.normalize(delta + t * b - s * a)
-                slip = (one - s) * node_velocity[node_i] + s * node_velocity[node_i + 1]
-                slip -= (one - t) * node_velocity[node_j] + t * node_velocity[node_j + 1]
-                spin = arms[2] * ((one - s) * node_spin[node_i] + s * node_spin[node_i + 1])
-                spin += arms[3] * ((one - t) * node_spin[node_j] + t * node_spin[node_j + 1])
+                slip = (one - s) * node_velocity[node_i] + s * node_velocity[end_i]
+                slip -= (one - t) * node_velocity[node_j] + t * node_velocity[end_j]
+                spin = arms[2] * ((one - s) * node_spin[node_i] + s * node_spin[end_i])
+                spin += arms[3] * ((one - t) * node_spin[node_j] + t * node_spin[end_j])
                 slip += wp.cross(spin, n)
                 force = pair_force[k]
                 size = wp.dot(force, n)

@@ -12,12 +12,13 @@ from typing import Any
 import warp as wp
 
 from warpfiber.model import precision
+from warpfiber.passes.pairs import NO_IMAGE
 
 NEVER = -2  # a step that is no pair's last one
 
 
 @cache
-def make_hand_over(name: str):
+def make_hand_over(name: str, closed: bool = False):
     """`neighbors_memory`: what a pair that begins to act takes over from those beside it."""
     p = precision(name)
     real, vec4 = p.real, p.vec4
@@ -41,6 +42,27 @@ def make_hand_over(name: str):
             if pair_j[k] == j and pair_image[k] == image and pair_step[side, k] == last:
                 return pair_memory[side, k]
         return vec4(zero, zero, zero, zero)
+
+    @wp.func
+    def memory_either_way(
+        i: wp.int32,
+        j: wp.int32,
+        image: wp.int32,
+        last: wp.int32,
+        out_start: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        pair_memory: wp.array2d(dtype=vec4),
+        pair_step: wp.array2d(dtype=wp.int32),
+    ) -> vec4:
+        """Over the closure of a ring that touches itself its pairs are listed the other way."""
+        if i > j or (i == j and image < wp.static(NO_IMAGE)):
+            back = wp.static(2 * NO_IMAGE) - image
+            kept = memory_of(
+                j, i, back, last, out_start, pair_j, pair_image, pair_memory, pair_step
+            )
+            return vec4(-kept[0], -kept[1], -kept[2], kept[3])
+        return memory_of(i, j, image, last, out_start, pair_j, pair_image, pair_memory, pair_step)
 
     @wp.func
     def neighbors_memory(
@@ -76,9 +98,14 @@ def make_hand_over(name: str):
                 else:
                     a = i
             if found[3] == zero and (a != i or b != j):
-                found = memory_of(
-                    a, b, image, last, out_start, pair_j, pair_image, pair_memory, pair_step
-                )
+                if wp.static(closed):
+                    found = memory_either_way(
+                        a, b, image, last, out_start, pair_j, pair_image, pair_memory, pair_step
+                    )
+                else:
+                    found = memory_of(
+                        a, b, image, last, out_start, pair_j, pair_image, pair_memory, pair_step
+                    )
         return found
 
     return neighbors_memory

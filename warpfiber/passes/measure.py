@@ -21,6 +21,7 @@ from warpfiber.laws.torque import make_torque
 from warpfiber.model import precision
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.precision import group_struct
+from warpfiber.passes.ring_nodes import make_ring_minimum
 from warpfiber.passes.tensor_sums import TENSOR, TENSOR4_NAMES, make_tensor_sums
 
 # Columns of the partial sums over fibers.
@@ -189,6 +190,7 @@ def make_measure_pairs(name: str, features: PairFeatures, module: str = "unique"
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Group = group_struct(name)
     closest_fractions, image_shift, is_local_minimum, lubricate = make_pair_geometry(name, features)
+    is_ring_minimum, closed = make_ring_minimum(name), features.closed
     _, repulsion_energy = make_repulsion(name)
     reach = real(RANGE)
     has_repulsion = features.repulsion
@@ -204,7 +206,9 @@ def make_measure_pairs(name: str, features: PairFeatures, module: str = "unique"
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
+        segment_end: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
+        fiber_ring: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=wp.mat33d),
         out_start: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
@@ -226,14 +230,20 @@ def make_measure_pairs(name: str, features: PairFeatures, module: str = "unique"
             gi = groups[fiber_group[fiber_i]]
             at_i = node_i - fiber_node_start[fiber_i]
             xi = node_pos[node_i]
-            a = node_pos[node_i + 1] - xi
+            end_i = node_i + 1
+            if wp.static(closed):
+                end_i = segment_end[i]
+            a = node_pos[end_i] - xi
             for k in range(out_start[i], out_start[i + 1]):
                 j = pair_j[k]
                 node_j = segment_node[j]
                 fiber_j = segment_fiber[j]
                 gj = groups[fiber_group[fiber_j]]
                 at_j = node_j - fiber_node_start[fiber_j]
-                b = node_pos[node_j + 1] - node_pos[node_j]
+                end_j = node_j + 1
+                if wp.static(closed):
+                    end_j = segment_end[j]
+                b = node_pos[end_j] - node_pos[node_j]
                 delta = node_pos[node_j] - xi + image_shift(pair_image[k], box)
                 st = closest_fractions(delta, a, b)
                 c = delta + st[1] * b - st[0] * a
@@ -244,9 +254,26 @@ def make_measure_pairs(name: str, features: PairFeatures, module: str = "unique"
                     overlap = wp.float64(wp.max(contact - distance, real(0.0)))
                     overlap = overlap / (wp.float64(contact) * wp.float64(0.5))
                     maxima_out[chunk, 0] = wp.max(maxima_out[chunk, 0], overlap)
-                    if is_local_minimum(
-                        st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
-                    ):
+                    is_minimum = wp.bool(False)
+                    if wp.static(closed):
+                        is_minimum = is_ring_minimum(
+                            st,
+                            c,
+                            node_i,
+                            at_i,
+                            gi.segments,
+                            fiber_ring[fiber_i],
+                            node_j,
+                            at_j,
+                            gj.segments,
+                            fiber_ring[fiber_j],
+                            node_pos,
+                        )
+                    else:
+                        is_minimum = is_local_minimum(
+                            st, c, node_i, at_i, gi.segments, node_j, at_j, gj.segments, node_pos
+                        )
+                    if is_minimum:
                         if distance <= contact:
                             touches = 1
                             sums_out[chunk, 0] = sums_out[chunk, 0] + one
@@ -292,6 +319,7 @@ def make_measure_terms(name: str, pairs: str):
         flow_origin: vec3,
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_segment_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         gradient: wp.array(dtype=mat33),
         node_pos: wp.array(dtype=vec3),
@@ -327,7 +355,7 @@ def make_measure_terms(name: str, pairs: str):
                 couple = torque_couple(g.torque * g.weight, n1, inverse1, dv, spin)
                 keep_largest(2, couple, terms_out)
                 if wp.static(has_pairs):
-                    segment = i - fiber
+                    segment = fiber_segment_start[fiber] + k
                     for pair in range(out_start[segment], out_start[segment + 1]):
                         if pair_acts[pair] != wp.uint8(0):
                             keep_largest(3, pair_force[pair], terms_out)

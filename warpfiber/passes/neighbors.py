@@ -85,14 +85,18 @@ class NeighborList:
         self.row_capacity = row_capacity
         self.pair_capacity = pair_capacity or max(64, 3 * model.segment_count // 2)
         self.workers = workers
+        closed = len(model.segment_end) > 0
         self.native = model.device.startswith("cpu") if native is None else native
+        self.native = self.native and not closed  # vectors know open fibers alone
         self.build_count = 0
         self.grow_count = 0
         self._executor: Executor | None = None
         self._cut_into_pieces()
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
-        features = ListFeatures(domain.periodic, domain.shear_axes, domain.sheared, has_pieces)
+        features = ListFeatures(
+            domain.periodic, domain.shear_axes, domain.sheared, has_pieces, closed
+        )
         if self.native:
             module = kernel_module("list", name, features)
             self.kernels = make_cell_kernels(name, features, True, module)
@@ -129,6 +133,9 @@ class NeighborList:
             return wp.array(values, dtype=wp.int32, device=model.device)
 
         self.fiber_skip = put(np.asarray(skip)[group])
+        nodes = np.diff(model.host["fiber_node_start"])
+        ring = np.where(np.bincount(fiber, minlength=len(nodes)) == nodes, nodes, 0)
+        self.fiber_ring = put(ring if len(model.segment_end) else ring[:0])
         if self.piece_count == segments:  # a piece is a segment: kernels do without these
             self.piece_segment = self.piece_part = put(np.zeros(0))
             return
@@ -309,7 +316,7 @@ class NeighborList:
         rest = np.asarray([row["rest"] for row in model.group_rows])
         rest = rest[model.host["fiber_group"][model.host["segment_fiber"]]]
         with np.errstate(over="ignore", invalid="ignore"):
-            length = np.linalg.norm(nodes[first + 1] - nodes[first], axis=1)
+            length = np.linalg.norm(nodes[model.host["segment_end"]] - nodes[first], axis=1)
             far = np.abs(nodes[first]).max(axis=1) > FARTHEST * (self.longest_rest + self.reach)
             lost = np.flatnonzero(~(length < TEAR_STRETCH * rest) | far)
         return int(model.host["segment_fiber"][lost[0]]) if len(lost) else None

@@ -38,6 +38,7 @@ class PairFeatures:
     lubrication: str = "none"  # none, paper, shifted
     periodic: bool = False
     sheared: bool = False  # images move: relative velocity needs the lattice velocity
+    closed: bool = False  # some fibers are rings
 
     @property
     def storage(self) -> str:

@@ -24,7 +24,7 @@ def make_row_kernels(name: str, features: ListFeatures):
     real, vec3 = p.real, p.vec3
     closest_fractions = make_segment_distance(name)
     px, py, pz = features.periodic
-    pieces = features.pieces
+    pieces, closed = features.pieces, features.closed
     mask, offset_image = WRAP_Y - 1, WRAP_Y // 2
     far_away = wp.float32(1e6)
     zero, half = wp.float32(0.0), wp.float32(0.5)
@@ -97,6 +97,7 @@ def make_row_kernels(name: str, features: ListFeatures):
         part: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
         fiber_skip: wp.array(dtype=wp.int32),
+        fiber_ring: wp.array(dtype=wp.int32),
         row_count_out: wp.array(dtype=wp.int32),
         row_i_out: wp.array(dtype=wp.int32),
         row_j_out: wp.array(dtype=wp.int32),
@@ -217,7 +218,11 @@ def make_row_kernels(name: str, features: ListFeatures):
                         j = segment[m]
                         code = run - wrap[m] + wrap[k]
                         if code == wp.static(NO_WRAP):
-                            if wp.abs(i - j) - 1 < fiber_skip[fiber]:
+                            apart = wp.abs(i - j)
+                            if wp.static(closed):
+                                if segment_fiber[j] == fiber and fiber_ring[fiber] > 0:
+                                    apart = wp.min(apart, fiber_ring[fiber] - apart)
+                            if apart - 1 < fiber_skip[fiber]:
                                 if segment_fiber[j] == fiber:
                                     continue
                         lower = k

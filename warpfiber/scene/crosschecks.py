@@ -131,10 +131,6 @@ def _check_bonded_spheres(draft: Draft) -> None:
         path = f"fibers.{index}"
         if group["bending_modulus"] == 0.0:
             draft.blame(f"{path}.bending_modulus", "a bond without bending has no shape; give > 0")
-        ring = group["shape"] is not None and group["shape"]["kind"] == "ring"
-        if ring and draft.contact["law"] not in (None, "none"):
-            remedy = 'contacts of rings are not available in this version; use contact.law = "none"'
-            draft.blame(f"{path}.shape.kind", remedy)
         if (group["poisson_ratio"] or 0.0) > LARGEST_POISSON:
             draft.blame(f"{path}.poisson_ratio", "no isotropic solid has more than 0.5")
     for index, stage in enumerate(draft.stages):
