@@ -243,7 +243,7 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "capsule_pairs", "plain", make_capsule_pairs(precision, CapsuleFeatures())
     rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
     yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
-    yield "carry_memory", "", make_carry_memory(precision)
+    yield "carry_memory", "", make_carry_memory(precision, True)
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)

@@ -128,7 +128,7 @@ class Recording:
         if self.trajectory is None:
             return
         row = self.last_row if self.row_step == self.frame_step else simulation.measure()
-        fields = {}
+        fields = simulation.method.node_fields()
         if "velocity" in self.scene.record.node_fields:
             fields["node_velocity"] = simulation.node_velocity
         values: dict[str, Any] = {k: v for k, v in row.items() if k not in MOMENT}

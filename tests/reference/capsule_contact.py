@@ -120,9 +120,10 @@ def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: floa
     per_integral = hertz(laws, [curvature(ra, 0.0), curvature(rb, angle)], depth)[0] / whole
     place = float(weights @ (overlap * z)) / integral
     t = (place - delta @ middle) / (b @ middle)
-    edge = gap(float(a @ middle)) - zero  # deepest along a, and a length of it further on each side
-    part = -(zero @ edge) / max(float(edge @ edge), 1e-30)
-    nearest = zero + min(max(float(part), -1.0), 2.0) * edge
+    # deepest along both, and a mean length of them further on each side
+    further = 0.5 * float(a @ middle + abs(b @ middle))
+    first, last = min(0.0, ends[0]) - further, max(float(a @ middle), ends[1]) + further
+    nearest = gap(min(max(-float(zero @ slope) / max(float(steep), 1e-30), first), last))
     return Touch(
         per_integral * integral,
         per_integral * (high - low),

@@ -205,6 +205,8 @@ def test_rows_and_lists_grow_on_the_way(meeting: Meeting, method: str) -> None:
     pairs._allocate_pairs()
     grown = pairs.grow_count
     for sim in runs:
+        sim.method.contact.search.refresh(sim.step_count)  # type: ignore[attr-defined]
+        sim.method._stop_executor()
         sim.step(20)
     assert pairs.grow_count > grown
     assert runs[0].node_pos.tobytes() == runs[1].node_pos.tobytes()

@@ -29,7 +29,10 @@ def layered_run(tmp_path: Path, frames: int = 9) -> ResultFolder:
         "path": str(tmp_path / "cell.toml"),
         "box": {"size": [1e-3] * 3, "boundary": ["periodic", "periodic", "wall"]},
         "flow": {"kind": "simple_shear"},
-        "fibers": [{"diameter": 4e-5, "layers": [layer] * 4}],
+        "fibers": [
+            {"diameter": 4e-5, "table": 0, "layers": [layer] * 4},
+            {"diameter": 4e-5, "table": 0},
+        ],
     }
     folder.write_scene(tables)
     names = ["step", "time", "strain", "layer", "z_low", "z_high", *COLUMNS]

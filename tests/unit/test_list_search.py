@@ -5,12 +5,15 @@ Sets of pairs are compared exactly with brute force and with the plain kernels (
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from tests.cell import Kind, bent_fiber, isotropic, straight_fiber
 from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
-from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, RATIO
+from warpfiber.methods.pair_search import STEP_PAIR_COST
+from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, PAIR_COST, RATIO
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pieces import piece_counts
 from warpfiber.scene import SceneError
@@ -174,6 +177,16 @@ def test_skin_follows_the_motion(start: Start) -> None:
     height = 13.0 / np.sqrt(1.25)
     assert tight.method.list.cell_width <= height
     assert tight.method.skin.largest < 4.0
+
+
+def test_pairs_cost_by_method(start: Start) -> None:
+    """An explicit step does less per listed pair than an implicit one, so its skin is thicker."""
+    kind = Kind(2, 4.0)
+    fibers, _ = random_fibers((kind,), 60, [34.0] * 3, seed=45, spread=5.0)
+    explicit = cell(start, (kind,), fibers, flow=SHEAR, box={"size": [34.0] * 3}).method.skin
+    assert explicit.pair_cost == PAIR_COST < STEP_PAIR_COST
+    implicit = dataclasses.replace(explicit, pair_cost=STEP_PAIR_COST)
+    assert implicit.choose(10, 1.0) < explicit.choose(10, 1.0)
 
 
 def test_report_of_builds_and_skins(start: Start) -> None:

@@ -152,13 +152,19 @@ def make_capsule_contact(name):
         return vec4(integral, center, w1, depth)
 
     @wp.func
-    def line_depth(d0: vec3, d1: vec3, reach: real) -> real:
-        """Deepest overlap along a and as far again beyond it at both ends.
+    def line_depth(d0: vec3, d1: vec3, reach: real, t0: real, t1: real, ratio: real) -> real:
+        """Deepest overlap along both segments and a mean length beyond them at both ends.
 
-        The same for neighbors that share a patch, whatever part of it is theirs.
+        The same for neighbors that share a patch, whatever part of it is theirs. t0, t1: parts of b
+        beside the ends of a; ratio: length of b over that of a.
         """
         dv = d1 - d0
-        u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), -one, two)
+        begin = -t0 / (t1 - t0)
+        end = (one - t0) / (t1 - t0)
+        beyond = half * (one + ratio)
+        low = wp.min(zero, wp.min(begin, end)) - beyond
+        high = wp.max(one, wp.max(begin, end)) + beyond
+        u = wp.clamp(-wp.dot(d0, dv) / wp.max(wp.dot(dv, dv), tiny), low, high)
         return reach - wp.length(d0 + u * dv)
 
     return curvatures, hertz_factor, side_by_side, line_overlap, line_depth, line_square

@@ -64,19 +64,22 @@ class BondedContacts:
 
     def kernels(self) -> list[Any]:
         """What a build launches."""
-        name = self.model.precision.name
-        return [*self.search.list.kernels.values(), make_carry_memory(name)]
+        return [*self.search.list.kernels.values(), self._carry()]
+
+    def _carry(self) -> Any:
+        return make_carry_memory(self.model.precision.name, self.features.friction)
 
     def _listed(self) -> list[Any]:
         pairs = self.search.list
-        return [pairs.out_start, pairs.pair_j, pairs.pair_image, *self._memories()]
+        return [pairs.out_start, pairs.pair_j, pairs.pair_image, *self._kept()]
 
-    def _memories(self) -> list[Any]:
-        return [self.acts, self.memory, self.written]
+    def _kept(self) -> list[Any]:
+        """By pair, from list to list."""
+        return [self.acts, self.force, self.arms, self.memory, self.written]
 
     def build(self, step: int) -> bool:
         """Build the list now and take the memories over; True if arrays were replaced."""
-        carries = self.features.friction and self.search.list.build_count > 0
+        carries = self.search.list.build_count > 0
         before = [wp.clone(array) for array in self._listed()] if carries else []
         replaced = self.search.refresh(step, wrap=False)
         if replaced:
@@ -84,8 +87,8 @@ class BondedContacts:
         if carries:
             model = self.model
             after = self._listed()
-            name, segments = model.precision.name, model.segment_count
-            carry_memories(name, segments, self.state.step, before, after, model.device)
+            step_count, segments = self.state.step, model.segment_count
+            carry_memories(self._carry(), segments, step_count, before, after, model.device)
         else:
             self.acts.zero_()
         return replaced
@@ -97,7 +100,13 @@ class BondedContacts:
     def saved(self) -> dict[str, np.ndarray]:
         """Skin, stretch and memories by pair: what the next list depends on."""
         count = self.search.list.pair_count
-        arrays = self.search.saved() | {"contact_acts": self.acts.numpy()[:count].copy()}
+        arrays = self.search.saved()
+        acts = self.acts.numpy()[:count].copy()
+        arrays["contact_acts"] = acts
+        for name in ("force", "arms"):  # what does not act keeps stale values
+            values = getattr(self, name).numpy()[:count].copy()
+            values[acts == 0] = 0.0
+            arrays[f"contact_{name}"] = values
         if self.features.friction:
             side = int(self.state.step.numpy()[0]) % 2
             arrays["contact_memory"] = self.memory.numpy()[side, :count].copy()
@@ -109,7 +118,8 @@ class BondedContacts:
         self.search.restore(arrays, step)
         self._allocate()
         count = self.search.list.pair_count
-        self.acts[:count].assign(arrays["contact_acts"])
+        for name in ("acts", "force", "arms"):
+            getattr(self, name)[:count].assign(arrays[f"contact_{name}"])
         if self.features.friction:
             side = step % 2
             self.memory[side, :count].assign(arrays["contact_memory"])

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfiber.methods.bed_measures import NODE_FIELDS, contact_forces, inclination_row
 from warpfiber.methods.bed_stages import BedStages
 from warpfiber.methods.bond_constants import bond_constants, is_closed
 from warpfiber.methods.bonded_contacts import BondedContacts
@@ -302,7 +303,15 @@ class BondedSpheres(Method):
 
     def measure(self) -> dict[str, float]:
         """Energies in J and what walls feel, where `record.quantities` asks for them."""
-        return self.press.measure() | self.grips.measure() | self.energies.measure()
+        row = self.press.measure() | self.grips.measure() | self.energies.measure()
+        wanted = self.scene.record.quantities
+        row |= contact_forces(self) if "contacts" in wanted else {}
+        return row | (inclination_row(self) if "inclination" in wanted else {})
+
+    def node_fields(self) -> dict[str, np.ndarray]:
+        """Those of `record.node_fields` that this method knows."""
+        wanted = [name for name in NODE_FIELDS if name in self.scene.record.node_fields]
+        return {f"node_{name}": NODE_FIELDS[name](self) for name in wanted}
 
     def saved(self) -> dict[str, np.ndarray]:
         """Stress-free shape, turns, spins and accelerations of the nodes."""

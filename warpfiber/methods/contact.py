@@ -30,7 +30,12 @@ from warpfiber.scene import Fault, Scene, SceneError
 # Radii: a row with a larger predicted gap is not made. Less halves more steps of soft fibers, with
 # 0.5 a cell of rods has a fifth more rows.
 KEEP = 0.3
+# Radii: the same in a cell whose fibers are bent from the start, as packed ones are. Others hold
+# them, and where a contact opens or closes they move on by more.
+KEEP_BENT = 1.0
+BENT = 0.1  # radii: nodes of such a fiber are farther than that from the line between its ends
 OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
+SLACK = 20.0  # tolerances of contact: or with more than these
 # Parts of the first step that no list lasts, below which a step is not worth taking: with a given
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
@@ -57,9 +62,31 @@ class MovingResponse(Response, Protocol):
         """`carried`: share of the velocity of contact that the fibers take on."""
 
 
+class StepLoad(Protocol):
+    """Forces of contact that stay on the fibers in the motion without contact."""
+
+    node_foreseen: Any  # (N,) vec3 where the step ends if they stay as they are
+
+    def note(self, dual: ContactDual, again: bool) -> Launch:
+        """After a solve; `again`: its forces come on top of those of the one before."""
+
+
 def has_contact(scene: Scene) -> bool:
     """Whether fibers meet one another or a wall."""
     return scene.contact.law != "none" or scene.contact.lubrication != "none"
+
+
+def largest_bend(model: Model, state: State) -> float:
+    """Largest distance of a node from the line between the ends of its fiber, run units."""
+    start = model.host["fiber_node_start"]
+    nodes = state.node_pos.numpy().astype(float)
+    counts = np.diff(start)
+    first = np.repeat(nodes[start[:-1]], counts, axis=0)
+    span = np.repeat(nodes[start[1:] - 1], counts, axis=0) - first
+    length2 = np.einsum("ij,ij->i", span, span)
+    along = np.einsum("ij,ij->i", nodes - first, span) / np.where(length2 > 0.0, length2, 1.0)
+    away = np.linalg.norm(nodes - first - along[:, None] * span, axis=1)
+    return float(away.max())
 
 
 def contact_law(scene: Scene, model: Model) -> ContactLaw:
@@ -90,13 +117,17 @@ class ImplicitContact:
         stretch: float,
         workers: int,
         response: MovingResponse,
+        load: StepLoad | None = None,
         fiber_frozen: Any = None,
     ) -> None:
         self.scene, self.model, self.state, self.step = scene, model, state, step
-        self.response, self.flow_origin = response, flow_origin
+        self.response, self.load, self.flow_origin = response, load, flow_origin
         self.hard = scene.numerics.contact == "unilateral"
+        tolerance = scene.numerics.contact_tolerance or 1e-3
+        self.overlap = max(OVERLAP, SLACK * tolerance) if self.hard else FINITE
         radii = [row["radius"] for row in model.group_rows]
-        reach = 2.0 * max(radii) + KEEP * min(radii)
+        keep = KEEP_BENT if largest_bend(model, state) > BENT * min(radii) else KEEP
+        reach = 2.0 * max(radii) + keep * min(radii)
         if scene.contact.lubrication != "none":
             reach = max(reach, OUTER * 2.0 * max(radii))
         self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
@@ -111,7 +142,8 @@ class ImplicitContact:
                 lattice_back=lattice[1:2] if again else lattice[0:1],
                 lattice_now=lattice[1:2],
                 step_size=step.step_size,
-                keep=KEEP,
+                node_foreseen=load.node_foreseen if load is not None and not again else None,
+                keep=keep,
                 lubrication="none" if again else scene.contact.lubrication,
             )
             dual = ContactDual(
@@ -122,7 +154,7 @@ class ImplicitContact:
                 response,
                 step_size=step.step_size,
                 node_start=step.node_back,
-                tolerance=(scene.numerics.contact_tolerance or 1e-3) * min(radii),
+                tolerance=tolerance * min(radii),
                 law=contact_law(scene, model),
                 fiber_frozen=fiber_frozen,
             )
@@ -149,16 +181,14 @@ class ImplicitContact:
     def launches(self) -> Launches:
         """From the motion without contact to the verdict on the step."""
         state, step, verdict = self.state, self.step, self.check.kernels
-        found: Launches = [
-            *self.check.list_launches(state.node_pos, step.deformation_next, self.flow_origin)
-        ]
-        gate = [self.check.list_short, state.status, step.rejected]
-        found.append(Launch("gate", verdict["gate_list"], 1, gate))
-        for rows, dual in self.solves:
+        found = self._listed(state.node_pos if self.load is None else self.load.node_foreseen)
+        for again, (rows, dual) in enumerate(self.solves):
             found += [*rows.launches(), *dual.launches(), self.response.apply(dual, carried=1.0)]
+            if self.load is not None:
+                found.append(self.load.note(dual, again > 0))
         needs = [rows.row_need for rows, _ in self.solves]
         judge = [
-            wp.float64(OVERLAP if self.hard else FINITE),
+            wp.float64(self.overlap),
             needs[0],
             needs[1] if len(needs) > 1 else self.no_need,
             self.check.largest,
@@ -167,10 +197,19 @@ class ImplicitContact:
             state.status,
             step.verdict,
         ]
+        found += self.check.launches()
+        found.append(Launch("verdict", verdict["judge_contacts"], 1, judge))
+        if self.load is not None:  # fibers that others bend may end elsewhere than was foreseen
+            found += self._listed(state.node_pos)
+        return found
+
+    def _listed(self, node_pos: Any) -> Launches:
+        """Whether the list holds for these ends of the step; without it there is no step."""
+        check, step = self.check, self.step
+        gate = [check.list_short, self.state.status, step.rejected]
         return [
-            *found,
-            *self.check.launches(),
-            Launch("verdict", verdict["judge_contacts"], 1, judge),
+            *check.list_launches(node_pos, step.deformation_next, self.flow_origin),
+            Launch("gate", check.kernels["gate_list"], 1, gate),
         ]
 
     def settle(self, step: int) -> bool:

@@ -177,7 +177,6 @@ class Energies:
             "dissipated_bonds": features.dashpots,
             "dissipated_contacts": spheres.scene.contact.damping > 0.0,
             "dissipated_friction": rubs,
-            "dissipated_settling": any(stage.damping > 0.0 for stage in spheres.scene.stages),
         }
         unit = model.units.energy
         return {name: value * unit for name, value in row.items() if present.get(name, True)}

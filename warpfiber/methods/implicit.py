@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfiber.methods.contact import ImplicitContact, MovingResponse, StepArrays, has_contact
+from warpfiber.methods.contact import (
+    ImplicitContact,
+    MovingResponse,
+    StepArrays,
+    StepLoad,
+    has_contact,
+)
 from warpfiber.methods.method import Method
 from warpfiber.methods.strain_steps import step_start
 from warpfiber.model import EXPIRED, TORN, Model, State
@@ -82,7 +88,7 @@ class Implicit(Method):
         """With contact none: every update of its forces hands over three times between workers."""
         return math.inf if has_contact(self.scene) else super()._worker_break_even()
 
-    def _make_contact(self, response: MovingResponse) -> None:
+    def _make_contact(self, response: MovingResponse, load: StepLoad | None = None) -> None:
         """Contact, once the arrays of the method exist."""
         if not self.meets:
             return
@@ -104,6 +110,7 @@ class Implicit(Method):
             stretch=float(self._segment_stretch().max()),
             workers=self.workers,
             response=response,
+            load=load,
             fiber_frozen=wp.array(frozen, dtype=wp.uint8, device=model.device)
             if frozen.any()
             else None,
@@ -129,6 +136,10 @@ class Implicit(Method):
     def motion(self) -> Launches:
         """Launches that move every fiber without contact and keep the start where asked to."""
 
+    def after(self) -> Launches:
+        """Launches once it is decided whether the step is kept."""
+        return []
+
     def launches(self) -> Launches:
         """Begin, motion, contact and end of a step, and what a rejected one needs."""
         return self._around(self.motion())
@@ -143,6 +154,7 @@ class Implicit(Method):
             errors = [chunks, self.fiber_error, self.error, self.error_fiber]
             steps.append(Launch("errors", make_largest_error(name, self.module), chunks, errors))
         steps.append(self._end())
+        steps += self.after()
         if self.keeps:
             steps.append(self._take_back())
         return steps

@@ -203,6 +203,10 @@ class Method(ABC):
         """Columns of the record beside those that all methods have, SI."""
         return {}
 
+    def node_fields(self) -> dict[str, np.ndarray]:
+        """Values by node of `record.node_fields` beside the velocity, SI."""
+        return {}
+
     @abstractmethod
     def saved(self) -> dict[str, np.ndarray]:
         """What the next step depends on beside the State, in run units."""

@@ -20,6 +20,7 @@ import warp as wp
 from warpfiber.methods.implicit import Implicit, Launches
 from warpfiber.methods.loads import node_loads
 from warpfiber.model import Model, State
+from warpfiber.passes.chain_load import ChainLoad
 from warpfiber.passes.chain_response import ChainResponse
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
@@ -55,8 +56,11 @@ class Overdamped(Implicit):
         self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         # the guess of the first step is the start: nothing is known of the velocity
         state.node_velocity.zero_()
+        self.load: ChainLoad | None = None
         if self.meets:
-            self._make_contact(ChainResponse(model, self.rows, self.row_stride, self.tension))
+            response = ChainResponse(model, self.rows, self.row_stride, self.tension)
+            self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
+            self._make_contact(response, self.load)
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -68,7 +72,13 @@ class Overdamped(Implicit):
         found: Launches = [self._solve(stages)]
         if any(group.frozen for group in self.scene.fibers):
             found.append(self._carry())
+        if self.load is not None:
+            found = [self.load.lay_on(), *found, self.load.take_off(self.step_size)]
         return found
+
+    def after(self) -> Launches:
+        """The contact forces of a step that is kept."""
+        return [] if self.load is None else [self.load.keep(self.rejected)]
 
     def tensions(self) -> tuple[Any, Any]:
         """Tensions now and at the start of the step."""
@@ -76,6 +86,9 @@ class Overdamped(Implicit):
 
     def _solve(self, stages: int) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
+        hold, given = self.node_hold, self.node_load
+        if self.load is not None:
+            hold, given = self.load.step_hold, self.load.step_load
         inputs = [
             stages,
             (2 if self.adaptive else 1) if self.keeps else 0,
@@ -95,14 +108,14 @@ class Overdamped(Implicit):
             self.node_back,
             self.velocity_back,
             self.fiber_error,
-            self.node_hold,
-            self.node_load,
+            hold,
+            given,
             state.fiber_image,
             state.lattice,
             state.status,
         ]
-        loaded = self.node_hold.shape[0] > 0
-        kernel = make_chain_step(p.name, loaded, loaded and model.domain.sheared)
+        held = self.node_hold.shape[0] > 0
+        kernel = make_chain_step(p.name, hold.shape[0] > 0, held and model.domain.sheared)
         return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
 
     def _carry(self) -> Launch:
@@ -149,6 +162,8 @@ class Overdamped(Implicit):
     def saved(self) -> dict[str, np.ndarray]:
         """Tensions and last displacements beside what every implicit method saves."""
         own = {f"overdamped_{name}": getattr(self, name).numpy().copy() for name in _CARRIED}
+        if self.load is not None:
+            own["overdamped_contact_load"] = self.load.contact_load.numpy().copy()
         return super().saved() | own
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -156,6 +171,8 @@ class Overdamped(Implicit):
         super().restore(arrays)
         for name in _CARRIED:
             getattr(self, name).assign(arrays[f"overdamped_{name}"])
+        if self.load is not None:
+            self.load.restore(arrays["overdamped_contact_load"])
 
 
 def overdamped_bytes(nodes: int, segments: int, real: int, adaptive: bool) -> int:

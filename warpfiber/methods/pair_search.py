@@ -46,6 +46,7 @@ class PairSearch:
     ) -> None:
         self.pair_cost = pair_cost
         self.scene, self.model, self.state = scene, model, state
+        self.pair_cost = pair_cost
         self.seconds = 0.0  # spent on builds
         self.radius = max(row["radius"] for row in model.group_rows)
         skin = START_SKIN * 2.0 * self.radius
@@ -136,10 +137,10 @@ class PairSearch:
         wanted = SPARE * slid * longer * self.skin.skin / before
         return max(0.0, min(wanted, 0.5 * (self._room() - self.skin.skin)))
 
-    def choose_skin(self, step: int) -> None:
-        """Another skin, the present one being used up."""
+    def choose_skin(self, step: int, used: float | None = None) -> None:
+        """Another skin, the present one being used up; `used` of it per step, if that is known."""
         listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
-        self.set_skin(self.skin.choose(step, listed))
+        self.set_skin(self.skin.choose(step, listed, used))
 
     def use_up(self, step: int, use: np.ndarray | None = None) -> bool:
         """Choose the next skin, the present one being used up; False if none would last a step.
@@ -151,12 +152,23 @@ class PairSearch:
         if short and (self.skin.fixed or self.skin.skin >= self.skin.largest):
             return False
         before = self.skin.skin
-        self.choose_skin(step)
+        share = self._share(use)
+        if short and share * before > self.skin.largest:
+            return False
         if short:
-            self.set_skin(min(self.skin.largest, LARGEST_CHANGE * before))
+            self.set_skin(min(self.skin.largest, max(SPARE * share, LARGEST_CHANGE) * before))
+        else:
+            steps = 1 + max(1, step - self.skin.built_step)  # and the one that it did not last
+            self.choose_skin(step, None if share == 0.0 else share * before / steps)
         if use is not None:
             self.set_extension(self._next_extension(use, before))
         return True
+
+    def _share(self, use: np.ndarray | None) -> float:
+        """Part of the skin that motion across the segments used up; 0 if that is not known."""
+        if use is None or not np.isfinite(use).all() or use[2] <= 0.0:
+            return 0.0
+        return float(use[1] / use[2])
 
     def refresh(self, step: int, *, wrap: bool = True) -> bool:
         """Build the list now (also clears its expiry); True if pair arrays were replaced."""

@@ -3,11 +3,17 @@
 A step costs build(s) u / s + pair_cost pairs(s) at the skin s, if motion uses up u of it per step.
 Builds tell u and the number of pairs; how the number changes with s follows from the volume around
 a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
-(excluded volume of spherocylinders, Onsager 1949). One list, not two: by their measured parts (ns
-per segment-step, skins in diameters) an outer list of skin 1.5 (build 316, every 44 steps) and one
-of 0.35 filtered from it (distances 36, order 15, every 9 steps) would come to 33 with the sweeps,
-one list of 0.57 (build 225, every 15 steps) to 38: too little for a second test of validity and a
-second list to save.
+(excluded volume of spherocylinders, Onsager 1949).
+
+One list of one skin against others: sums of parts measured on one state, with lives counted along
+one run (20,000 segments of 5 diameters, V_f = 0.1, SIMD, strain 0.001 per step; ns per segment-step
+of list and pair sweep, skins in diameters). One list: 26 with a skin of 0.6 (build 249, every 15
+steps, sweep 9.4), 25 of 0.8. An outer list of 1.2 (build 348, every 32 steps) and one of 0.3
+filtered from it (distances 18, index 3, every 7 steps, sweep 5.9): 20, which is 5 of some 50 in
+all, for a second test of validity and a second list to save. Skins and extensions by the speed of
+each segment last 18 steps with the pairs that one skin needs for 14: few fibers, pushed by others,
+end any list (with half as many pairs 21 of the 20,000 segments in 20 steps, 136 in 40), so that
+such skins pay only if these are listed anew on their own.
 
 Nothing here looks at a clock: two runs, and a run and its continuation, choose the same skins and
 so build at the same steps.
@@ -27,6 +33,7 @@ START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
+LASTING = 1.3  # uses of a step that a skin must have room for
 MEMORY = 0.5  # weight of the use before in the mean
 # Measured: listed pairs grow with the volume from this part of the distance in contact on.
 CORE = 0.85
@@ -70,18 +77,30 @@ class SkinChoice:
     def _steps_since(self, step: int) -> int:
         return max(0, step - max(self.built_step, self.begun))
 
-    def choose(self, step: int, pairs_per_segment: float) -> float:
-        """The skin of the next build, after the present one was used up at `step`."""
-        used = self.skin / max(1, step - self.built_step)
+    def choose(self, step: int, pairs_per_segment: float, used: float | None = None) -> float:
+        """The skin of the next build, after the present one was used up at `step`.
+
+        `used` of it per step, if that is known: then no skin is chosen that lasts none.
+        """
+        least_lasting = 0.0
+        if used is None:
+            used = self.skin / max(1, step - self.built_step)
+        else:
+            least_lasting = LASTING * max(used, self.use)
         self.use = used if self.use == 0.0 else MEMORY * self.use + (1.0 - MEMORY) * used
         if self.fixed or pairs_per_segment <= 0.0:
             return self.skin
         low = max(self.least, self.skin / LARGEST_CHANGE)
         high = min(self.largest, self.skin * LARGEST_CHANGE)
         best, least = self.skin, WORTH * self.cost(self.skin, pairs_per_segment)
+        if best < least_lasting:
+            best, least = min(self.largest, least_lasting), math.inf
         skin = self.least
         while skin <= high:
-            if skin >= low and (cost := self.cost(skin, pairs_per_segment)) < least:
+            if (
+                skin >= max(low, least_lasting)
+                and (cost := self.cost(skin, pairs_per_segment)) < least
+            ):
                 best, least = skin, cost
             skin *= RATIO
         return best

@@ -32,6 +32,9 @@ _MEANINGS: dict[str, tuple[str, str]] = {
     "interactions_per_fiber": ("", "pairs of segments that act on each other, for both fibers"),
     "contacts_per_fiber": ("", "pairs of segments that touch, counted for both fibers"),
     "coordination_number": ("", "mean number of distinct fibers that a fiber touches"),
+    "contact_force_mean": ("N", "mean size of the force of a contact between two fibers"),
+    "contact_force_pair_mean": ("N", "mean size of the force between two fibers that touch"),
+    "inclination_mean": ("degrees", "angle of end-to-end vectors with the horizontal, mean"),
     "overlap_max": ("radii", "largest overlap of two fibers"),
     "overlap_mean": ("radii", "mean overlap of the pairs that touch"),
     "axial_strain_max": ("", "largest axial strain of a segment, without sign"),
@@ -52,6 +55,7 @@ _PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"a[123]{4}", "", f"fourth-order orientation tensor, {BY_LENGTH}"),
     (r"a[123]{4}_fiber", "", f"fourth-order orientation tensor, {BY_NUMBER}"),
     (r"energy_\w+", "J", "energy of this kind, all fibers"),
+    (r"inclination_\d\d_\d\d", "", "share of fibers inclined by this many degrees"),
     (r"dissipated_\w+", "J", "energy lost in this way since the start"),
     (r"stress_[123]{2}", "Pa", "what the fibers add to the stress of the box, tension positive"),
     (

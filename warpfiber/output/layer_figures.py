@@ -111,10 +111,13 @@ def _shown(table: LayerTable, points: Mapping[str, Mapping[str, Any]]) -> list[i
 
 
 def _asked_fraction(scene: Mapping[str, Any]) -> dict[str, tuple[Floats, Floats]]:
-    """Edges (m) and values of the volume fraction that the layers of the scene ask for."""
+    """Edges (m) and values of the volume fraction that the layers of the scene ask for.
+
+    Of a table that was split into lengths only the first group carries the layers.
+    """
     groups = scene.get("fibers") or []
-    tables = {group.get("table", k): group for k, group in enumerate(groups)}
-    layers = [group["layers"] for group in tables.values() if group.get("layers")]
+    tables = {group.get("table", k) for k, group in enumerate(groups)}
+    layers = [group["layers"] for group in groups if group.get("layers")]
     if len(tables) != 1 or not layers:
         return {}
     edges = np.cumsum([0.0] + [float(layer["thickness"]) for layer in layers[0]])

@@ -80,7 +80,7 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False):
                 stiffness = modulus * factor * sine * length / wp.sqrt(two * reach)
                 t = wp.clamp(beside[2] + over[1] * (beside[3] - beside[2]), zero, one)
                 line = vec4(stiffness * over[0], stiffness * over[2], over[1], t)
-                deepest = line_depth(d0, d1, reach)
+                deepest = line_depth(d0, d1, reach, beside[2], beside[3], lb / la)
                 if wp.static(has_energy):
                     square = line_square(d0, d1, reach, beside[0], beside[1])
                     line_energy = half * stiffness * square

@@ -86,6 +86,7 @@ def make_end_kernels(name: str):
         end_known: wp.array(dtype=wp.uint8),
         end_force: wp.array(dtype=real),
         end_move: wp.array(dtype=real),
+        end_diagonal: wp.array(dtype=real),
     ):
         fiber = wp.tid() + offset
         begin = end_start[fiber]
@@ -99,6 +100,7 @@ def make_end_kernels(name: str):
             end_known[e] = wp.uint8(0)
             end_force[e] = real(0.0)
             end_move[e] = real(0.0)
+            end_diagonal[e] = real(0.0)
             if e - begin < owned:
                 end_row[e] = own
                 row_end[2 * own] = e
@@ -163,6 +165,7 @@ def make_chain_moves(name: str, has_frozen: bool):
         end_known: wp.array(dtype=wp.uint8),
         end_force: wp.array(dtype=real),
         end_move: wp.array(dtype=real),
+        end_diagonal: wp.array(dtype=real),
     ):
         if control[wp.static(NEXT_PHASE)] == wp.static(DONE):
             return
@@ -268,6 +271,7 @@ def make_chain_moves(name: str, has_frozen: bool):
                             fraction = row_t[r]
                             normal = row_normal[r]
                         block[column + e - begin] = end_motion(node, fraction, normal, node_shift)
+                    end_diagonal[source] = block[column + source - begin]
                 for e in range(begin, end):
                     end_move[e] = end_move[e] + force * block[column + e - begin]
             column += end - begin

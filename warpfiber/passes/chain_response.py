@@ -193,6 +193,7 @@ class ChainResponse:
         self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
         self.end_known = self._array(ends, wp.uint8)
         self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
+        self.end_diagonal = self._array(ends, real)
         share = BLOCK_SHARE if self.block_share is None else self.block_share
         self.block = self._array(share * ends, real)
 
@@ -217,6 +218,7 @@ class ChainResponse:
             self.end_known,
             self.end_force,
             self.end_move,
+            self.end_diagonal,
         ]
         return [
             Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
@@ -263,6 +265,7 @@ class ChainResponse:
             self.end_known,
             self.end_force,
             self.end_move,
+            self.end_diagonal,
         ]
         kernel = make_chain_moves(model.precision.name, dual.has_frozen)
         return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
@@ -355,5 +358,5 @@ class ChainResponse:
 
 def chain_response_bytes(nodes: int, segments: int, rows: int, real: int) -> int:
     """Bytes of the arrays of `ChainResponse`, for reals of `real` bytes."""
-    per_row = 2 * (8 + 1 + (2 + BLOCK_SHARE) * real)
+    per_row = 2 * (8 + 1 + (3 + BLOCK_SHARE) * real)
     return nodes * 7 * real + segments * real + rows * per_row

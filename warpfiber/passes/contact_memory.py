@@ -85,10 +85,10 @@ def make_hand_over(name: str):
 
 
 @cache
-def make_carry_memory(name: str):
-    """Kernel `carry_memory`: memories of the list before for the pairs of the new one."""
+def make_carry_memory(name: str, has_friction: bool):
+    """Kernel `carry_memory`: what pairs of the list before had, for the pairs of the new one."""
     p = precision(name)
-    vec4 = p.vec4
+    vec3, vec4 = p.vec3, p.vec4
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def carry_memory(
@@ -97,12 +97,16 @@ def make_carry_memory(name: str):
         old_j: wp.array(dtype=wp.int32),
         old_image: wp.array(dtype=wp.int32),
         old_acts: wp.array(dtype=wp.uint8),
+        old_force: wp.array(dtype=vec3),
+        old_arms: wp.array(dtype=vec4),
         old_memory: wp.array2d(dtype=vec4),
         old_step: wp.array2d(dtype=wp.int32),
         out_start: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         acts_out: wp.array(dtype=wp.uint8),
+        force_out: wp.array(dtype=vec3),
+        arms_out: wp.array(dtype=vec4),
         memory_out: wp.array2d(dtype=vec4),
         step_out: wp.array2d(dtype=wp.int32),
     ):
@@ -117,17 +121,21 @@ def make_carry_memory(name: str):
                 if old_acts[m] != wp.uint8(0):
                     if old_j[m] == pair_j[k] and old_image[m] == pair_image[k]:
                         acts = wp.uint8(1)
-                        memory = old_memory[side, m]
-                        written = old_step[side, m]
+                        force_out[k] = old_force[m]
+                        arms_out[k] = old_arms[m]
+                        if wp.static(has_friction):
+                            memory = old_memory[side, m]
+                            written = old_step[side, m]
             acts_out[k] = acts
-            memory_out[side, k] = memory
-            step_out[side, k] = written
+            if wp.static(has_friction):
+                memory_out[side, k] = memory
+                step_out[side, k] = written
 
     return carry_memory
 
 
 def carry_memories(
-    name: str, segments: int, step: Any, before: list[Any], after: list[Any], device: str
+    kernel: Any, segments: int, step: Any, before: list[Any], after: list[Any], device: str
 ) -> None:
     """Launch `carry_memory` over all segments; arrays of the list before and of the new one."""
-    wp.launch(make_carry_memory(name), dim=segments, inputs=[step, *before, *after], device=device)
+    wp.launch(kernel, dim=segments, inputs=[step, *before, *after], device=device)

@@ -36,6 +36,8 @@ class ContactRows:
     `row_compliance`, `row_force`; those of segment i are `row_out_start[i:i+2]`, those of listed
     pair k the `pair_row_count[k]` from `pair_row[k]` on, `pair_clear` what its center lines surely
     stay apart without contact; `row_count` (1) in all, `row_need` (1) is 0 unless they do not fit.
+    `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
+    where it would end without them unless given.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class ContactRows:
         lattice_back: Any,
         lattice_now: Any,
         step_size: Any,
+        node_foreseen: Any = None,
         keep: float = KEEP,
         lubrication: str = "none",
         capacity: int | None = None,
@@ -55,6 +58,8 @@ class ContactRows:
         self.model, self.state, self.pairs = model, state, pairs
         self.node_back, self.step_size = node_back, step_size
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
+        self.foresees = node_foreseen is not None
+        self.node_foreseen = node_foreseen if self.foresees else state.node_pos
         self.keep = keep
         domain = model.domain
         self.features = RowFeatures(
@@ -100,7 +105,11 @@ class ContactRows:
         self.pair_row = self._int(self.pair_capacity)
         self.pair_row_count = self._int(self.pair_capacity)
         real = self.model.precision.real
-        self.pair_clear = wp.zeros(self.pair_capacity, dtype=real, device=self.model.device)
+        device = self.model.device
+        self.pair_clear = wp.zeros(self.pair_capacity, dtype=real, device=device)
+        self.pair_seen: Any = None  # the same of the foreseen motion, where it is another
+        if self.foresees:
+            self.pair_seen = wp.zeros(self.pair_capacity, dtype=real, device=device)
         self.pair_slots = wp.zeros(self.pair_capacity, dtype=wp.uint8, device=self.model.device)
 
     def grow(self) -> bool:
@@ -138,7 +147,8 @@ class ContactRows:
         ]
         return [
             self._launch("carry_rows", self._carry_inputs()),
-            self._motion(),
+            self._motion(self.state.node_pos, self.pair_clear),
+            *([self._motion(self.node_foreseen, self.pair_seen)] if self.foresees else []),
             self._launch("count_rows", self._count_inputs()),
             Call("row_scan", scan),
             Launch("limit_rows", self.kernels["limit_rows"], 1, limit),
@@ -149,8 +159,8 @@ class ContactRows:
         dim = self.model.segment_count
         return Launch(name, self.kernels[name], dim, inputs, split=True, follows=follows)
 
-    def _motion(self) -> Launch:
-        model, pairs, state = self.model, self.pairs, self.state
+    def _motion(self, node_pos: Any, pair_clear: Any) -> Launch:
+        model, pairs = self.model, self.pairs
         inputs = [
             model.segment_count,
             model.segment_node,
@@ -161,9 +171,9 @@ class ContactRows:
             self.lattice_back,
             self.lattice_now,
             self.node_back,
-            state.node_pos,
-            state.status,
-            self.pair_clear,
+            node_pos,
+            self.state.status,
+            pair_clear,
         ]
         kernel = self.kernels["pair_motion"]
         return Launch("pair_motion", kernel, self.motion_dim, inputs, split=True, follows=True)
@@ -202,7 +212,7 @@ class ContactRows:
         ]
 
     def _count_inputs(self) -> list[Any]:
-        real, state = self.model.precision.real, self.state
+        real = self.model.precision.real
         widest = max(row["radius"] for row in self.model.group_rows)
         return [
             real(self.keep),
@@ -210,9 +220,9 @@ class ContactRows:
             *self._walls(),
             *self._fibers(),
             self.node_back,
-            state.node_pos,
-            state.status,
-            self.pair_clear,
+            self.node_foreseen,
+            self.state.status,
+            self.pair_clear if self.pair_seen is None else self.pair_seen,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,
@@ -227,6 +237,7 @@ class ContactRows:
             state.fiber_image,
             self.node_back,
             state.node_pos,
+            self.node_foreseen,
             self.step_size,
             self.carried_start,
             self.carried_j,

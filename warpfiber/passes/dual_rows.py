@@ -121,7 +121,9 @@ def make_dual_step(name: str, module: str = "unique"):
 def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"):
     """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
 
-    `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`.
+    `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`,
+    and what they move by a unit force of their own in `end_diagonal` where that is known (else 0);
+    it is taken for D before the first update if it is more than the estimate.
     """
     p = precision(name)
     real, vec3 = p.real, p.vec3
@@ -149,6 +151,7 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
         node_shift: wp.array(dtype=vec3),
         row_end: wp.array(dtype=wp.int32),
         end_move: wp.array(dtype=real),
+        end_diagonal: wp.array(dtype=real),
         row_balance: wp.array(dtype=real),
         sums: wp.array(dtype=wp.float64),
         best: wp.array(dtype=wp.float64),
@@ -166,6 +169,7 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
         if phase != wp.static(GO):
             return
         count = row_count[0]
+        first = control[wp.static(NEXT_UPDATES)] == 0
         moved = wp.float64(0.0)
         mixed = wp.float64(0.0)
         turned = wp.float64(0.0)
@@ -187,6 +191,13 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
             force = row_force[r]
             soft = row_compliance[r]
             weight = row_weight[r]
+            if wp.static(by_ends):
+                if first and weight > zero:
+                    known = end_diagonal[row_end[2 * r]]
+                    if row_end[2 * r + 1] >= 0:
+                        known += end_diagonal[row_end[2 * r + 1]]
+                    weight = one / wp.max(one / weight, known)
+                    row_weight[r] = weight
             fault = zero
             if soft > zero:
                 e += soft * force

@@ -217,10 +217,10 @@ class Measurement:
         )
 
     def _coordination(self, pairs: NeighborList, touches: np.ndarray) -> float:
-        """Mean number of distinct fibers (images apart) that a fiber touches."""
+        """Mean number of distinct other fibers (images apart) that a fiber touches."""
         i, j, image = pairs.host_pairs()
-        touching = touches[: len(i)] != 0
         fiber = self.model.host["segment_fiber"]
+        touching = (touches[: len(i)] != 0) & (fiber[i] != fiber[j])
         keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
         return 2.0 * len(np.unique(keys, axis=0)) / self.counted
 

@@ -145,6 +145,7 @@ class RodResponse:
         self.relaxes = model.device.startswith("cpu")
         self.row_end = wp.zeros(0, dtype=wp.int32, device=model.device)
         self.end_move = wp.zeros(0, dtype=model.precision.real, device=model.device)
+        self.end_diagonal = wp.zeros(0, dtype=model.precision.real, device=model.device)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
         """Nothing."""

@@ -92,6 +92,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
         fiber_image: wp.array(dtype=wp.vec3i),
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        node_foreseen: wp.array(dtype=vec3),
         step_size: wp.array(dtype=wp.float64),
         carried_start: wp.array(dtype=wp.int32),
         carried_j: wp.array(dtype=wp.int32),
@@ -219,9 +220,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                             if wp.static(has_arrays):
                                 if wall_array[2 * axis + side][1] > zero:
                                     continue
-                            gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
-                            gap -= gi.radius
-                            if gap < keep * gi.radius:
+                            gap = wall_gap(node_foreseen[node], axis, side, wall_low, wall_high)
+                            if gap - gi.radius < keep * gi.radius:
+                                gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
                                 normal = vec3(zero, zero, zero)
                                 normal[axis] = real(2 * side - 1)
                                 key = 4 * axis + 2 * side + (node - node_i)
@@ -231,7 +232,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 row_s_out[r] = real(node - node_i)
                                 row_t_out[r] = zero
                                 row_normal_out[r] = normal
-                                row_base_out[r] = gap
+                                row_base_out[r] = gap - gi.radius
                                 row_compliance_out[r] = zero
                                 row_force_out[r] = carried_row_force(
                                     wp.static(WALL),
@@ -244,7 +245,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 )
                                 r += 1
             if wp.static(has_arrays):
-                moved = wp.max(wp.length(move_i), wp.length(move_i + wa))
+                seen_i = node_foreseen[node_i] - xi
+                seen_a = node_foreseen[node_i + 1] - xi - a - seen_i
+                moved = wp.max(wp.length(seen_i), wp.length(seen_i + seen_a))
                 for axis in range(1, 3):
                     for side in range(2):
                         shape = wall_array[2 * axis + side]
@@ -270,8 +273,8 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 shape,
                                 gi.radius,
                             )
-                            base = gap - wp.dot(normal, move_i + t * wa)
-                            if base < keep * gi.radius:
+                            if gap - wp.dot(normal, seen_i + t * seen_a) < keep * gi.radius:
+                                base = gap - wp.dot(normal, move_i + t * wa)
                                 key = array_key(place, xi, xi + a, axis, side, wall_low, shape)
                                 row_i_out[r] = i
                                 row_j_out[r] = wp.static(WALL)

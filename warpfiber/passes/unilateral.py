@@ -60,9 +60,10 @@ class Incoming(Protocol):
 class Response(Protocol):
     """How fibers move by the forces of the rows: `rod_response`, `chain_response`."""
 
-    by_ends: bool  # it makes `row_end` and `end_move`, see `dual_rows.make_dual_balance`
+    by_ends: bool  # it makes `row_end` and the arrays of ends, see `dual_rows.make_dual_balance`
     row_end: Any
     end_move: Any
+    end_diagonal: Any
     relaxes: bool  # on this device
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
@@ -260,6 +261,7 @@ class ContactDual:
             self.node_shift,
             self.response.row_end,
             self.response.end_move,
+            self.response.end_diagonal,
             self.row_balance,
             self.sums,
             self.best,

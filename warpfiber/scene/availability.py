@@ -24,9 +24,10 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
                          "rest"), 'use one of the linear flows, e.g. kind = "gradient"'),
     Row("record", "quantities", ("orientation", "orientation4", "contacts", "overlap",
                                  "interactions", "axial_strain", "energy", "rotation",
-                                 "curvature", "stress"),
+                                 "curvature", "stress", "inclination"),
         "remove the others from the list"),
-    Row("record", "node_fields", ("velocity",), "remove the others from the list"),
+    Row("record", "node_fields", ("velocity", "bond_stress", "contact_count"),
+        "remove the others from the list"),
     Row("wall", "kind", ("fiber_array",),
         'remove the table; planes come from boundary = "wall", stages move them'),
 )  # fmt: skip
@@ -46,6 +47,7 @@ FLOWING = (
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
     Row("contact", "friction", (0.0,), "remove it; contacts are frictionless"),
     Row("contact", "wall_friction", (0.0,), "remove it; walls are frictionless"),
+    Row("record", "node_fields", ("velocity",), "remove it; it is of method bonded_spheres"),
 )
 SOFT = Row("contact", "law", ("none", "exponential", "linear"),
            'use law = "exponential", "linear" or "none"')  # fmt: skip

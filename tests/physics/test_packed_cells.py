@@ -1,0 +1,114 @@
+"""Cells of fibers that packing has bent: others hold them, and they move by whole steps.
+
+Source: a fiber that springs back without contact leaves every row made for that motion behind; with
+the forces of the last step on it a step is as long as the motion of the cell allows.
+Tolerance: forces on nodes are sums of the rows' to rounding; a step is halved for an overlap of
+more than 0.05 radii, or 20 tolerances of contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.meeting_cell import last_rows, rejected
+from warpfiber.methods.contact import BENT, largest_bend
+from warpfiber.scene import scene_from_dict
+from warpfiber.simulation import Simulation
+
+DT = 0.05
+
+
+def packed_scene(**numerics: Any) -> Any:
+    """Glass in a melt, in layers of a plate: 160 fibers that random straight ones cannot be."""
+    return scene_from_dict(
+        {
+            "seed": 3,
+            "box": {"size": [1.1e-3, 1.1e-3, 2e-4], "boundary": ["periodic", "periodic", "wall"]},
+            "flow": {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 300.0},
+            "fibers": [
+                {
+                    "diameter": 19e-6,
+                    "density": 2500.0,
+                    "youngs_modulus": 7e10,
+                    "length_distribution": {
+                        "number_average": 4e-4,
+                        "weight_average": 5.3e-4,
+                        "maximum": 1e-3,
+                        "minimum": 1e-4,
+                    },
+                    "volume_fraction": 0.0793,
+                    "orientation": [0.36, 0.62, 0.02, 0, 0, 0],
+                }
+            ],
+            "contact": {"law": "exponential"},
+            "stage": [{"kind": "flow", "end_strain": 2.0}],
+            "numerics": {
+                "method": "overdamped",
+                "segment_length": 2e-4,
+                "dt": DT,
+                "contact": "unilateral",
+                **numerics,
+            },
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def packed() -> Iterator[Simulation]:
+    """The cell after its first step that was kept."""
+    sim = Simulation(packed_scene(), workers=1)
+    assert largest_bend(sim.model, sim.state) > BENT
+    assert not sim.method.load.contact_load.numpy().any()  # type: ignore[attr-defined]
+    sim.step(1)
+    yield sim
+    sim.close()
+
+
+def row_loads(sim: Simulation) -> np.ndarray:
+    """(N, 3) forces of the last rows on the nodes."""
+    host, rows = sim.model.host, last_rows(sim)
+    load = np.zeros((sim.model.node_count, 3))
+    push = rows["force"][:, None] * rows["normal"]
+    for side, share, sign in (("i", rows["s"], -1.0), ("j", rows["t"], 1.0)):
+        met = rows[side] >= 0
+        node = host["segment_node"][rows[side][met]]
+        np.add.at(load, node, sign * (1.0 - share[met])[:, None] * push[met])
+        np.add.at(load, node + 1, sign * share[met][:, None] * push[met])
+    return load
+
+
+def test_forces_of_a_step_that_is_kept_stay(packed: Simulation) -> None:
+    """Also after steps that were taken back: the first were, their fibers sprang too far."""
+    assert rejected(packed) > 0
+    kept = packed.method.load.contact_load.numpy()  # type: ignore[attr-defined]
+    expected = row_loads(packed)
+    assert np.abs(expected).max() > 0.0
+    eps = np.finfo(float).eps
+    assert np.abs(kept - expected).max() < 100.0 * eps * np.abs(expected).max()
+
+
+def test_packed_cell_moves_by_whole_steps(packed: Simulation) -> None:
+    """Once the bends of the packing have settled none is halved for long; nothing overlaps."""
+    packed.run(until=1.0)
+    taken, turned_down = packed.step_count, rejected(packed)
+    packed.run(until=2.0)
+    assert packed.step_count - taken <= 2.0 * (1.0 / DT)
+    assert rejected(packed) - turned_down <= 0.5 * (1.0 / DT)
+    assert taken < 100
+    assert packed.method.contact.check.largest.numpy()[0] <= 0.05  # type: ignore[attr-defined]
+    assert packed.method.contact.check.found.numpy()[0] == 0  # type: ignore[attr-defined]
+
+
+def test_tolerance_of_contact_hardly_matters() -> None:
+    """The orientation after a strain of 1 with four times the tolerance, to 0.01."""
+    found = []
+    for tolerance in (1e-2, 2.5e-3):
+        sim = Simulation(packed_scene(contact_tolerance=tolerance), workers=1)
+        sim.run(until=1.0)
+        found.append(sim.measure()["a11"])
+        sim.close()
+    assert abs(found[0] - found[1]) < 0.01
