@@ -205,6 +205,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
         ),
         ("bed", bed, (False, True)),
         ("pressed bed", replace(bed, press=2), (False, True)),
+        ("bed in a container", replace(bed, container=True), (False, True)),
         ("gripped bed", replace(bed, press=2, loads=True, grips=True), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
