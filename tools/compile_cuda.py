@@ -59,6 +59,7 @@ from warpfiber.passes.measure import (
 from warpfiber.passes.measure_layers import make_measure_layers
 from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
+from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
@@ -206,6 +207,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
         ),
         ("bed", bed, (False, True)),
         ("pressed bed", replace(bed, press=2), (False, True)),
+        ("bed in a container", replace(bed, container=True), (False, True)),
         ("gripped bed", replace(bed, press=2, loads=True, grips=True), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
@@ -289,10 +291,12 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
         ("array", (False, False, True), "none", True),
     ):
         features = RowFeatures(True, walls, lubrication, arrays)
-        checks = make_check_sweeps(precision, CheckFeatures(True, walls, arrays=arrays))
+        check = CheckFeatures(True, walls, shifted=True, again=True, arrays=arrays)
+        checks = make_check_sweeps(precision, check)
         for name, kernel in (make_row_count(precision, features) | checks).items():
             yield name, variant, kernel
         yield "fill_rows", variant, make_row_fill(precision, features)
+    yield "pair_motion", "", make_pair_motion(precision, True)
     for name, kernel in make_list_bound(precision).items():
         yield name, "", kernel
     for variant, fibers in {

@@ -254,14 +254,14 @@ speed = 0.3
 end_volume_fraction = 0.35
 [[stage]]
 kind = "pull"
-freeze_below = 0.004
-freeze_above = 0.009
+freeze_below = 0.003
+freeze_above = 0.006
 speed = 0.2
-end_strain = 1.5
+end_strain = 2
 [[stage]]
 kind = "shear"
-freeze_below = 0.004
-freeze_above = 0.012
+freeze_below = 0.003
+freeze_above = 0.008
 speed = 0.2
 end_strain = 1
 [record]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from warpfiber.scene import scene_from_dict
+from warpfiber.scene import SceneError, scene_from_dict
 from warpfiber.simulation import Diverged, Simulation
 
 FIBERS = {
@@ -104,7 +104,7 @@ def test_stiff_contacts_set_the_step() -> None:
     assert 4.0 * sim.limits[0].dt < 0.2 * bonds
     assert gains(sim, 0.03, 0.0)[0] < 1e-3
     loose = bed(contact=stiff, fraction=4.0)
-    with pytest.raises(Diverged):
+    with pytest.raises((Diverged, SceneError)):  # torn, or farther in a step than any list lasts
         loose.step(20_000)
 
 

@@ -104,7 +104,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *make_list_bound("float32"),
         *make_contact_verdict(),
         *make_end_kernels("float32"),
-        *("fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
+        *("pair_motion fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
         *("rod_response rod_apply chain_moves chain_response chain_apply".split()),
     }
     names = {kernel for kernel, _, _ in tool.kernels("float32")}

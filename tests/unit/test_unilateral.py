@@ -250,6 +250,12 @@ def test_best_iterate_is_kept(start: Start) -> None:
     assert len(set(faults)) < 12  # some updates made it worse
 
 
+def test_solves_that_stop_at_their_limit_are_counted(start: Start) -> None:
+    rods = Rods(start)
+    assert rods.solve().dual.unsolved == 0
+    assert rods.solve(most=1, tolerance=1e-12, repeats=3).dual.unsolved == 3
+
+
 def test_frozen_rods_do_not_move(start: Start) -> None:
     rods = Rods(start)
     frozen = np.arange(30) % 3 == 0

@@ -17,6 +17,7 @@ import numpy as np
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.methods.bond_constants import bond_constants
 from warpfiber.scene import FiberGroup, Scene
+from warpfiber.scene.containers import container
 
 Matrix = np.ndarray
 OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
@@ -66,7 +67,8 @@ def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
     }
     contact = scene.contact
     end, inner = (c.end_mass, c.end_inertia), (c.mass, c.inertia)
-    if scene.box is not None and "wall" in scene.box.boundary:
+    walled = scene.box is not None and "wall" in scene.box.boundary
+    if walled or container(scene) is not None:
         stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)
         steps["walls"] = touch_step(scene, group, end, stiffness, contact.wall_friction)
     if contact.law != "none":

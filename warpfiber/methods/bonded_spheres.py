@@ -42,6 +42,7 @@ from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
+from warpfiber.scene.containers import container
 from warpfiber.scene.gripping import GRIPPING
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
@@ -72,7 +73,9 @@ class BondedSpheres(Method):
             loads=self.holds.used,
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
-            wall_friction=scene.contact.wall_friction > 0.0 and any(model.domain.wall),
+            wall_friction=scene.contact.wall_friction > 0.0
+            and (any(model.domain.wall) or container(scene) is not None),
+            container=container(scene) is not None,
             press=self.press.axis,
             grips=self.grips.used,
         )

@@ -23,6 +23,7 @@ from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Fault, Scene, SceneError
@@ -220,8 +221,12 @@ class ImplicitContact:
             words[[EXPIRED, HALT]] = 0
             self.state.status.assign(words)
             return True
-        if not self.search.use_up(step, self.check.list_use.numpy()[0]):
+        use = self.check.list_use.numpy()[0].copy()
+        if self.check.share_back.numpy()[0] == FORESEEN:  # what the next step would have found
+            use[:2] *= 1.0 + 1.0 / max(1, step - self.search.skin.built_step)
+        if not self.search.use_up(step, use):
             self._halve()
+        self.check.share_back.zero_()
         return self.search.refresh(step)
 
     def _halve(self) -> None:
@@ -244,6 +249,7 @@ class ImplicitContact:
     def saved(self) -> dict[str, np.ndarray]:
         """What the next step depends on: list, skin and the forces of the last rows."""
         arrays = self.search.saved()
+        arrays["list_share"] = self.check.share_back.numpy().copy()
         for number, (rows, _) in enumerate(self.solves):
             arrays |= {f"rows{number}_{key}": value for key, value in rows.saved().items()}
         return arrays
@@ -251,19 +257,26 @@ class ImplicitContact:
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
         """Take over what `saved` returned."""
         self.search.restore(arrays, step)
+        self.check.share_back.assign(arrays["list_share"])
         for number, (rows, _) in enumerate(self.solves):
             head = f"rows{number}_"
             rows.restore({key[len(head) :]: arrays[key] for key in arrays if key.startswith(head)})
 
     def report(self) -> dict[str, float]:
-        """Rows, updates of the forces and the largest fault of the last step, radii."""
+        """Rows, updates and largest fault (radii) of the last step; unsolved so far."""
         rows, dual = self.solves[0]
         radius = min(row["radius"] for row in self.model.group_rows)
         return {
             "rows": int(rows.row_count.numpy()[0]),
             "updates": dual.updates,
             "fault": dual.fault / radius,
+            "unsolved_contacts": self.unsolved,
         }
+
+    @property
+    def unsolved(self) -> int:
+        """Solves of this process whose forces are not within the tolerance."""
+        return sum(dual.unsolved for _, dual in self.solves)
 
     def fiber_push(self) -> np.ndarray:
         """(F,) sum of the sizes of the contact forces on each fiber in the last step, run units."""

@@ -7,6 +7,7 @@ end (time, flow; acceptance and the size of the next step where it may be reject
 from __future__ import annotations
 
 import math
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -70,6 +71,7 @@ class Implicit(Method):
         first = step_start(scene) / model.units.time if self.adaptive else self.dt
         self.step_size = wp.array([min(first, self.dt)], dtype=wp.float64, device=device)
         self.contact: ImplicitContact | None = None
+        self._warned = False
         self.stress: FiberStress | None = None
         if "stress" in scene.record.quantities and scene.flow is not None:
             self.stress = FiberStress(
@@ -157,6 +159,8 @@ class Implicit(Method):
         steps += self.after()
         if self.keeps:
             steps.append(self._take_back())
+        if self.contact is not None:
+            steps.append(self.contact.check.foresee(self.rejected))
         return steps
 
     def _begin(self) -> Launch:
@@ -249,6 +253,14 @@ class Implicit(Method):
         status = self._status()
         if status[TORN]:
             return False
+        if self.contact is not None and not self._warned and self.contact.unsolved:
+            self._warned = True
+            warnings.warn(
+                "contact forces of a step are not within numerics.contact_tolerance: take smaller "
+                "steps or a larger tolerance (unsolved_contacts in summary.json counts them)",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         if status[EXPIRED] and self.contact is not None:
             if self.contact.settle(self.step_count):
                 self._stop_executor()

@@ -65,6 +65,7 @@ class Method(ABC):
         self.set_gradient()
         self.executor: Executor | None = None
         self._status_view: np.ndarray | None = None
+        self._step_view: np.ndarray | None = None
         self.pair_acts = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.pair_force = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
 
@@ -159,7 +160,9 @@ class Method(ABC):
     @property
     def step_count(self) -> int:
         """Steps taken."""
-        return int(self.state.step.numpy()[0])
+        if self._step_view is None or not self.model.device.startswith("cpu"):
+            self._step_view = self.state.step.numpy()
+        return int(self._step_view[0])
 
     @property
     def counted_fibers(self) -> int:

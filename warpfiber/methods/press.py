@@ -33,6 +33,7 @@ from warpfiber.passes.wall_servo import (
     make_wall_servo,
 )
 from warpfiber.scene import Fault, Scene, SceneError, Stage
+from warpfiber.scene.containers import container
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.gripping import GRIPPING, HEIGHT
 from warpfiber.scene.pouring import UP
@@ -55,7 +56,12 @@ class Press:
         device = model.device
         low = np.asarray(model.domain.low)
         self.corners = np.array([low, low + np.asarray(model.domain.size)])
-        self.place = wp.array(self.corners, dtype=wp.vec3d, device=device)
+        places, round_wall = self.corners, container(scene)
+        if round_wall is not None:  # its axis and radius
+            assert round_wall.center is not None and round_wall.radius is not None
+            side = np.array([*round_wall.center[:2], round_wall.radius]) / model.units.length
+            places = np.concatenate([places, side[None]])
+        self.place = wp.array(places, dtype=wp.vec3d, device=device)
         metered = int(self.axis >= 0)
         fibers = metered * model.fiber_count
         self.velocity = wp.zeros(metered, dtype=wp.vec2d, device=device)
@@ -71,6 +77,8 @@ class Press:
             assert scene.box is not None
             rule = scene.box.volume_rule
             self.area = scene.box.volume / scene.box.size[self.axis]
+            if round_wall is not None and round_wall.radius is not None and self.axis == 2:
+                self.area = math.pi * round_wall.radius**2
             self.fiber_volumes = [
                 fiber_volume(rule, group.diameter, group.length) for group in scene.fibers
             ]

@@ -14,7 +14,7 @@ from warpfiber.laws.bond import make_bond
 from warpfiber.laws.hertz import make_hertz
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.node_walls import SIDES
+from warpfiber.passes.node_walls import CONTAINER, SIDES, make_concave
 
 # Columns; those of walls are zero without them.
 ENERGIES = (
@@ -30,7 +30,12 @@ ENERGIES = (
 
 
 @cache
-def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: bool = False):
+def make_measure_bonds(
+    name: str,
+    walls: tuple[bool, bool, bool],
+    has_friction: bool = False,
+    has_container: bool = False,
+):
     """Kernel `measure_bonds`: energies (F, len(ENERGIES)) of the present state."""
     p = precision(name)
     real, vec3, vec4 = p.real, p.vec3, p.vec4
@@ -38,14 +43,15 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: 
     _, bond_energies, _ = make_bond(name)
     plane_stiffness, _, plane_energy = make_hertz(name)
     wall_x, wall_y, wall_z = walls
-    has_walls = any(walls)
+    has_walls = any(walls) or has_container
+    container_gap, inside_radius = make_concave(name)
     half_real = real(0.5)
 
     @wp.func
-    def rubbed_energy(g: BondGroup, depth: real, h: vec3) -> wp.float64:
+    def rubbed_energy(g: BondGroup, radius: real, depth: real, h: vec3) -> wp.float64:
         """Of the memory of a wall's friction; a stale one has no depth."""
         k = real(4.0) * g.compliance / g.shear_compliance
-        k *= plane_stiffness(g.wall_modulus, g.radius, depth)
+        k *= plane_stiffness(g.wall_modulus, radius, depth)
         return wp.float64(half_real * k * wp.length_sq(h))
 
     @wp.func
@@ -54,6 +60,7 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: 
         x: wp.vec3d,
         low: wp.vec3d,
         high: wp.vec3d,
+        side: wp.vec3d,
         i: wp.int32,
         wall_memory: wp.array(dtype=vec3),
     ) -> wp.vec2d:
@@ -72,8 +79,15 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: 
                 energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, above))
                 if wp.static(has_friction):
                     slot = wp.static(SIDES) * i + 2 * axis
-                    energy[1] += rubbed_energy(g, below, wall_memory[slot])
-                    energy[1] += rubbed_energy(g, above, wall_memory[slot + 1])
+                    energy[1] += rubbed_energy(g, g.radius, below, wall_memory[slot])
+                    energy[1] += rubbed_energy(g, g.radius, above, wall_memory[slot + 1])
+        if wp.static(has_container):
+            radius = inside_radius(g.radius, side)
+            depth = g.radius - container_gap(x, side)[3]
+            energy[0] += wp.float64(plane_energy(g.wall_modulus, radius, depth))
+            if wp.static(has_friction):
+                h = wall_memory[wp.static(SIDES) * i + wp.static(CONTAINER)]
+                energy[1] += rubbed_energy(g, radius, depth, h)
         return energy
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -111,7 +125,12 @@ def make_measure_bonds(name: str, walls: tuple[bool, bool, bool], has_friction: 
             kinetic += half * (moving + inertia * wp.length_sq(wp.vec3d(node_spin[i])))
             gravity -= mass * wp.dot(wp.vec3d(g.weight), place[i] - middle)
             if wp.static(has_walls):
-                wall += walls_energy(g, place[i], wall_place[0], wall_place[1], i, wall_memory)
+                side = wp.vec3d()
+                if wp.static(has_container):
+                    side = wall_place[2]
+                wall += walls_energy(
+                    g, place[i], wall_place[0], wall_place[1], side, i, wall_memory
+                )
             j = i + 1
             if i == last:
                 j = first

@@ -16,7 +16,7 @@ from warpfiber.laws.hertz import DASHPOT, make_hertz
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import SETTLING, BondFeatures
-from warpfiber.passes.node_walls import SIDES
+from warpfiber.passes.node_walls import CONTAINER, SIDES, make_concave
 
 LOST = ("bonds", "settling", "walls", "wall friction")  # columns
 
@@ -33,6 +33,8 @@ def make_bond_losses(name: str, features: BondFeatures):
     _, friction_force = make_friction(name)
     wall_x, wall_y, wall_z = features.walls
     has_walls, has_friction = any(features.walls), features.wall_friction
+    has_container = features.container
+    container_gap, inside_radius = make_concave(name)
     has_dashpots = features.dashpots
     zero, half = real(0.0), real(0.5)
     spring_part, dashpot = real(2.0 / 3.0), real(DASHPOT)
@@ -71,6 +73,7 @@ def make_bond_losses(name: str, features: BondFeatures):
         now: Node,
         n: vec3,
         gap: real,
+        curvature_radius: real,
         approach: real,
         slot: wp.int32,
         memories: wp.array(dtype=vec3),
@@ -79,7 +82,7 @@ def make_bond_losses(name: str, features: BondFeatures):
         depth = g.radius - gap
         if depth <= zero:
             return zero, zero
-        k = plane_stiffness(g.wall_modulus, g.radius, depth)
+        k = plane_stiffness(g.wall_modulus, curvature_radius, depth)
         size = plane_push(k, beta, mass, depth, wp.dot(amid.v, n) - approach)
         lost = (spring_part * k * depth - size) * (wp.dot(now.v, n) - approach)
         rubbed = zero
@@ -159,16 +162,16 @@ def make_bond_losses(name: str, features: BondFeatures):
                     if axis == 2:
                         has_wall = wp.static(wall_z)
                     if has_wall:
-                        for side in range(2):
+                        for side_of in range(2):
                             n = vec3(zero, zero, zero)
-                            n[axis] = real(1 - 2 * side)
-                            gap = real(now.x[axis] - wall_place[side][axis])
-                            if side == 1:
+                            n[axis] = real(1 - 2 * side_of)
+                            gap = real(now.x[axis] - wall_place[side_of][axis])
+                            if side_of == 1:
                                 gap = -gap
                             approach = zero
                             if axis == press:
-                                approach = n[axis] * real(wall_velocity[0][side])
-                            slot = wp.static(SIDES) * i + 2 * axis + side
+                                approach = n[axis] * real(wall_velocity[0][side_of])
+                            slot = wp.static(SIDES) * i + 2 * axis + side_of
                             loss, slid = wall_loss(
                                 g,
                                 wall_damping,
@@ -178,12 +181,31 @@ def make_bond_losses(name: str, features: BondFeatures):
                                 now,
                                 n,
                                 gap,
+                                g.radius,
                                 approach,
                                 slot,
                                 wall_memory,
                             )
                             at_walls += wp.float64(loss)
                             rubbed += wp.float64(slid)
+            if wp.static(has_container):
+                side = container_gap(now.x, wall_place[2])
+                loss, slid = wall_loss(
+                    g,
+                    wall_damping,
+                    wall_friction,
+                    mass,
+                    amid,
+                    now,
+                    vec3(side[0], side[1], side[2]),
+                    side[3],
+                    inside_radius(g.radius, wall_place[2]),
+                    zero,
+                    wp.static(SIDES) * i + wp.static(CONTAINER),
+                    wall_memory,
+                )
+                at_walls += wp.float64(loss)
+                rubbed += wp.float64(slid)
         lost[fiber, 0] = lost[fiber, 0] + dt * in_bonds
         lost[fiber, 1] = lost[fiber, 1] + dt * in_settling
         lost[fiber, 2] = lost[fiber, 2] + dt * at_walls

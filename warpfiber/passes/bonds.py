@@ -36,6 +36,7 @@ class BondFeatures:
     pairs: bool = False
     wall_friction: bool = False
     press: int = -1  # axis whose walls may move and are metered
+    container: bool = False  # a cylinder around the fibers
     grips: bool = False  # what acts on the nodes of grips is told; needs `loads`
 
 
@@ -51,9 +52,11 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     Node = node_struct(name)
     bond_loads, _, bond_dashpots = make_bond(name)
     turned = make_rotation(name)
-    wall_loads = make_node_walls(name, features.walls, features.wall_friction, features.press)
+    wall_loads = make_node_walls(
+        name, features.walls, features.wall_friction, features.press, features.container
+    )
     gather_pairs = make_gather(name)
-    has_walls, is_metered = any(features.walls), features.press >= 0
+    has_walls, is_metered = any(features.walls) or features.container, features.press >= 0
     has_dashpots, has_loads = features.dashpots, features.loads
     has_rings, has_pairs = features.closed, features.pairs
     has_grips = features.grips

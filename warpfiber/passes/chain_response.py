@@ -364,9 +364,3 @@ class ChainResponse:
         ]
         kernel = make_chain_apply(model.precision.name, dual.module)
         return Launch("chain_apply", kernel, model.fiber_count, inputs, split=True)
-
-
-def chain_response_bytes(nodes: int, segments: int, rows: int, real: int) -> int:
-    """Bytes of the arrays of `ChainResponse`, for reals of `real` bytes."""
-    per_row = 2 * (8 + 1 + (3 + BLOCK_SHARE) * real)
-    return nodes * 7 * real + segments * real + rows * per_row

@@ -81,6 +81,9 @@ class ContactCheck:
         vec3, device = model.precision.vec3, model.device
         self.fiber_use = wp.zeros(model.fiber_count, dtype=vec3, device=device)
         self.list_use = wp.zeros(1, dtype=vec3, device=device)
+        self.fiber_share = wp.zeros(model.fiber_count, dtype=model.precision.real, device=device)
+        self.list_share = wp.zeros(1, dtype=model.precision.real, device=device)
+        self.share_back = wp.zeros(1, dtype=model.precision.real, device=device)
 
     def _int(self, size: int) -> Any:
         return wp.zeros(size, dtype=wp.int32, device=self.model.device)
@@ -145,12 +148,19 @@ class ContactCheck:
             state.status,
             self.fiber_short,
             self.fiber_use,
+            self.fiber_share,
         ]
-        reduced = [self.fiber_short, self.fiber_use, state.status, self.list_short, self.list_use]
+        reduced = [self.fiber_short, self.fiber_use, self.fiber_share, state.status]
+        reduced += [self.list_short, self.list_use, self.list_share]
         return [
             self._launch("bound_fibers", model.fiber_count, bound, split=True),
             self._launch("bound_list", 1, reduced),
         ]
+
+    def foresee(self, rejected: Any) -> Launch:
+        """After the end of a step: whether the list would not last the next."""
+        inputs = [rejected, self.list_share, self.state.status, self.share_back]
+        return self._launch("foresee_list", 1, inputs)
 
     def _launch(self, name: str, dim: int, inputs: list[Any], split: bool = False) -> Launch:
         return Launch(name, self.kernels[name], dim, inputs, split=split)

@@ -22,8 +22,9 @@ from warpfiber.model import precision
 
 FIRST_STEP = 0.3
 START, GO, RESTORE, DONE = range(4)  # phases of the solve
-PHASE, UPDATES, NEXT_PHASE, NEXT_UPDATES = range(4)  # slots of `control`
-CONTROL_SIZE = 4
+# slots of `control`; UNSOLVED: solves so far that stopped at their limit
+PHASE, UPDATES, NEXT_PHASE, NEXT_UPDATES, UNSOLVED = range(5)
+CONTROL_SIZE = 5
 SUMS = 4  # dx.dx, dx.dg, dg.dg, largest fault
 BROKEN = 1e30  # the fault of a row that is not a number
 
@@ -96,6 +97,8 @@ def make_dual_step(name: str, module: str = "unique"):
             control[wp.static(NEXT_PHASE)] = following
             if runs:
                 control[wp.static(NEXT_UPDATES)] = updates + 1
+            elif phase == wp.static(GO) and not (fault < tolerance):
+                control[wp.static(UNSOLVED)] = control[wp.static(UNSOLVED)] + 1
             best[1] = least
         if not runs and following != wp.static(RESTORE):
             return

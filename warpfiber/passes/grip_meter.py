@@ -80,19 +80,21 @@ def make_grip_meter():
         for chunk in range(chunk_low.shape[0]):
             low += chunk_low[chunk]
             high += chunk_high[chunk]
-        component = wp.int32(task[wp.static(COMPONENT)])
+        is_x = task[wp.static(COMPONENT)] == wp.float64(0.0)
+        now = wp.where(is_x, high[0], high[2])
+        before = wp.where(is_x, grip[1][0], grip[1][2])
         steps = course[wp.static(STEPS)] + wp.float64(1.0)
-        acted = wp.float64(0.5) * (grip[1][component] + high[component])
+        acted = wp.float64(0.5) * (before + now)
         share = wp.float64(1.0) / wp.float64(wp.static(AVERAGED))
         if steps == wp.float64(1.0):
             share = wp.float64(1.0)
-            acted = high[component]
+            acted = now
         course[wp.static(WORK)] = course[wp.static(WORK)] - dt * acted * task[wp.static(SPEED)]
         grip[0] = low
         grip[1] = high
         grip_mean[0] = grip_mean[0] + share * (low - grip_mean[0])
         grip_mean[1] = grip_mean[1] + share * (high - grip_mean[1])
-        force = -grip_mean[1][component]
+        force = -wp.where(is_x, grip_mean[1][0], grip_mean[1][2])
         if steps == wp.float64(1.0) or force > course[wp.static(PEAK)]:
             course[wp.static(PEAK)] = force
             course[wp.static(PEAK_STEP)] = steps

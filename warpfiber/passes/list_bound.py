@@ -4,22 +4,25 @@ Source: a segment as listed, carried by the flow since the build: the line from 
     one listed node to that of the other, longer by the extension of the list at both ends. If no
     node is farther than u from the line of each of its segments, no unlisted pair is within reach
     while 2 u + (1 - sigma_min(F)) h_list <= skin. What slides along itself, as rigid fibers do in a
-    flow that would stretch them, uses up the extension first.
+    flow that would stretch them, uses up the extension first. A list whose use, growing as in the
+    last step, would be too much in the next one is built before that, not after it has failed.
 Symbols: F deformation since the build, sigma_min its smallest singular value, h_list reach + skin,
     x_o origin of the flow; `use` of a list: farthest sliding and distance from the lines without
-    end, and the largest u allowed.
+    end, and the largest u allowed; `share` its largest u over that.
 """
 
 from functools import cache
 
 import warp as wp
 
-from warpfiber.model import HALT, precision
+from warpfiber.model import EXPIRED, HALT, precision
+
+FORESEEN = 2.0  # in place of a share, of which none that is kept is above 1
 
 
 @cache
 def make_list_bound(name: str, module: str = "unique"):
-    """`bound_fibers` and `bound_list` in launch order, as a dict by name."""
+    """`bound_fibers`, `bound_list`, `foresee_list` in launch order, as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     zero, half, one = real(0.0), real(0.5), real(1.0)
@@ -51,6 +54,7 @@ def make_list_bound(name: str, module: str = "unique"):
         status: wp.array(dtype=wp.int32),
         short_out: wp.array(dtype=wp.int32),
         use_out: wp.array(dtype=vec3),
+        share_out: wp.array(dtype=real),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -60,6 +64,7 @@ def make_list_bound(name: str, module: str = "unique"):
         found = wp.int32(0)
         slid = zero
         across = zero
+        most = zero
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
             listed = list_pos[i + 1] - list_pos[i]
             length = wp.length(listed)
@@ -71,31 +76,57 @@ def make_list_bound(name: str, module: str = "unique"):
                 apart = node_pos[i + end] - start
                 s = wp.dot(apart, axis) * inverse
                 nearest = wp.clamp(s, -beyond, one + beyond)
-                if not (wp.length_sq(apart - nearest * axis) <= limit * limit):
+                off = wp.length_sq(apart - nearest * axis)
+                if not (off <= limit * limit):
                     found = 1
+                most = wp.max(most, off)
                 slid = wp.max(slid, wp.max(-s, s - one) * length)
                 across = wp.max(across, wp.length_sq(apart - s * axis))
         if limit < zero:
             found = 1
         short_out[fiber] = found
         use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
+        share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
 
     @wp.kernel(**options)
     def bound_list(
         fiber_short: wp.array(dtype=wp.int32),
         fiber_use: wp.array(dtype=vec3),
+        fiber_share: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
         list_short_out: wp.array(dtype=wp.int32),
         list_use_out: wp.array(dtype=vec3),
+        list_share_out: wp.array(dtype=real),
     ):
         if status[wp.static(HALT)] != 0:
             return
         found = wp.int32(0)
         use = vec3()
+        share = zero
         for fiber in range(fiber_short.shape[0]):
+            share = wp.max(share, fiber_share[fiber])
             found = wp.max(found, fiber_short[fiber])
             use = wp.max(use, fiber_use[fiber])
         list_short_out[0] = found
         list_use_out[0] = use
+        list_share_out[0] = share
 
-    return {"bound_fibers": bound_fibers, "bound_list": bound_list}
+    @wp.kernel(**options)
+    def foresee_list(
+        rejected: wp.array(dtype=wp.int32),
+        list_share: wp.array(dtype=real),
+        status: wp.array(dtype=wp.int32),
+        share_back: wp.array(dtype=real),
+    ):
+        """At the end of a step that is kept; `share_back` its share, 0 where the list is new."""
+        if status[wp.static(HALT)] + rejected[0] != 0:
+            return
+        share = list_share[0]
+        foreseen = share + (share - share_back[0])
+        share_back[0] = share
+        if foreseen > one:
+            status[wp.static(EXPIRED)] = 1
+            share_back[0] = real(wp.static(FORESEEN))
+
+    kernels = [bound_fibers, bound_list, foresee_list]
+    return dict(zip(["bound_fibers", "bound_list", "foresee_list"], kernels, strict=True))

@@ -18,7 +18,7 @@ Symbols: e balance of a row, a length; `low` the largest e of either sign for wh
 
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import precision
-from warpfiber.passes.dual_rows import BROKEN, NEXT_UPDATES
+from warpfiber.passes.dual_rows import BROKEN, NEXT_UPDATES, UNSOLVED
 
 OVER = 1.2
 SHARE = 0.5
@@ -144,6 +144,7 @@ RELAX = """
     }
     for (int r = 0; r < count; ++r) row_force.data[r] = state[r].force;
     best.data[1] = fault;
+    if (fault > T(tolerance)) ++control.data[unsolved];
     control.data[next_updates] = (relaxed + count - 1) / count;
 """
 
@@ -168,6 +169,6 @@ def relaxation_texts(name: str, law: str) -> tuple[str, str, str]:
     constexpr double broken = {BROKEN!r};
     constexpr double edge = {RANGE - 1.0!r};
     constexpr bool yields = {str(law != "hard").lower()};
-    constexpr int next_updates = {NEXT_UPDATES};
+    constexpr int next_updates = {NEXT_UPDATES}, unsolved = {UNSOLVED};
 """
     return numbers + OPENING[law] + ROWS, INCOMING, RELAX

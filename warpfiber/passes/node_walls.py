@@ -1,7 +1,9 @@
-"""Contact of one node with the plane walls of the box: Hertz, dashpot, friction with memory.
+"""Contact of one node with the walls of box and container: Hertz, dashpot, friction with memory.
 
 Source: laws `hertz` and `friction`; walls are rigid. Those of axis `press` move along their normal,
-    and what they push with is told.
+    and what they push with is told. A container is a cylinder along z around the fibers: inside it
+    R* = 1 / (1 / a - 1 / R).
+Symbols: places of walls: lower and upper corner, and of a container (x, y of its axis, R).
 """
 
 from functools import cache
@@ -13,11 +15,42 @@ from warpfiber.laws.hertz import DASHPOT, make_hertz
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 
-SIDES = 6  # places of a node's memories: axis by axis, low before high
+SIDES = 7  # places of a node's memories: axis by axis, low before high; the container
+CONTAINER = 6
 
 
 @cache
-def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: bool, press: int):
+def make_concave(name: str):
+    """`container_gap(x, place)`: (way inwards, gap) from the container to a center, or no way."""
+    p = precision(name)
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    zero, one = real(0.0), real(1.0)
+
+    @wp.func
+    def container_gap(x: wp.vec3d, place: wp.vec3d) -> vec4:
+        across = vec3(real(x[0] - place[0]), real(x[1] - place[1]), zero)
+        away = wp.length(across)
+        if away == zero:
+            return vec4(one, zero, zero, real(place[2]))
+        n = across / -away
+        return vec4(n[0], n[1], zero, real(place[2]) - away)
+
+    @wp.func
+    def inside_radius(radius: real, place: wp.vec3d) -> real:
+        """R* of a sphere inside the container."""
+        return radius / (one - radius / real(place[2]))
+
+    return container_gap, inside_radius
+
+
+@cache
+def make_node_walls(
+    name: str,
+    walls: tuple[bool, bool, bool],
+    has_friction: bool,
+    press: int,
+    has_container: bool = False,
+):
     """`wall_loads`: force and moment of all walls on a node; memories move on by dt.
 
     Third, the pushes of the two walls of axis `press` (-1: none).
@@ -28,6 +61,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
     Node = node_struct(name)
     plane_stiffness, plane_push, _ = make_hertz(name)
     carried_memory, friction_force = make_friction(name)
+    container_gap, inside_radius = make_concave(name)
     wall_x, wall_y, wall_z = walls
     zero, half = real(0.0), real(0.5)
     dashpot = real(DASHPOT)
@@ -42,6 +76,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
         node: Node,
         n: vec3,
         gap: real,
+        curvature_radius: real,
         approach: real,
         slot: wp.int32,
         memories: wp.array(dtype=vec3),
@@ -59,7 +94,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                 if depths[slot] != zero:
                     depths[slot] = zero
             return force, moment, zero
-        k = plane_stiffness(g.wall_modulus, g.radius, depth)
+        k = plane_stiffness(g.wall_modulus, curvature_radius, depth)
         speed = wp.dot(node.v, n) - approach
         size = plane_push(k, beta, mass, depth, speed)
         if wp.static(has_friction):
@@ -120,6 +155,7 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                         node,
                         n,
                         gap,
+                        g.radius,
                         approach,
                         wp.static(SIDES) * i + 2 * axis + side,
                         memories,
@@ -129,6 +165,25 @@ def make_node_walls(name: str, walls: tuple[bool, bool, bool], has_friction: boo
                     moment += couple
                     if axis == wp.static(press):
                         pushes[side] = wp.float64(size)
+        if wp.static(has_container):
+            from_side = container_gap(node.x, wall_place[2])
+            push, couple, _size = one_wall(
+                g,
+                beta,
+                friction,
+                dt,
+                mass,
+                node,
+                vec3(from_side[0], from_side[1], from_side[2]),
+                from_side[3],
+                inside_radius(g.radius, wall_place[2]),
+                zero,
+                wp.static(SIDES) * i + wp.static(CONTAINER),
+                memories,
+                depths,
+            )
+            force += push
+            moment += couple
         return force, moment, pushes
 
     return wall_loads

@@ -20,6 +20,7 @@ from warpfiber.passes.dual_rows import (
     CONTROL_SIZE,
     NEXT_UPDATES,
     SUMS,
+    UNSOLVED,
     make_dual_balance,
     make_dual_step,
     make_fold_sums,
@@ -122,7 +123,12 @@ class ContactDual:
         none = wp.zeros(0, dtype=wp.uint8, device=device)
         self.fiber_frozen = fiber_frozen if self.has_frozen else none
         self.module = kernel_module(
-            "dual", model.precision.name, self.law.kind, self.has_frozen, response.by_ends
+            "dual",
+            model.precision.name,
+            self.law.kind,
+            self.has_frozen,
+            response.by_ends,
+            self.relaxes,
         )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
         # how far contact moved each segment off its motion without, at most
@@ -291,11 +297,11 @@ class ContactDual:
         return int(self.control.numpy()[NEXT_UPDATES])
 
     @property
+    def unsolved(self) -> int:
+        """Solves so far that stopped at their limit."""
+        return int(self.control.numpy()[UNSOLVED])
+
+    @property
     def fault(self) -> float:
         """Largest fault of the last solve, a length."""
         return float(self.best.numpy()[1])
-
-
-def bytes_per_row(real: int, law: ContactLaw) -> int:
-    """Bytes per row of the arrays above, for reals of `real` bytes."""
-    return 12 + real * (5 if law.kind == "exponential" else 4)

@@ -35,15 +35,16 @@ def make_wall_servo():
     ):
         if status[wp.static(HALT)] != 0 or servo[wp.static(SIDE)] < wp.float64(0.0):
             return
-        side = wp.int32(servo[wp.static(SIDE)])
         past = time[0] - dt - servo[wp.static(BEGIN)]  # the clock is ahead of the push
         load = servo[wp.static(FIRST)] + servo[wp.static(RATE)] * past
         load = wp.max(load, wp.float64(0.0))
         v = wall_velocity[0]
-        u = servo[wp.static(INWARD)] * v[side]
-        u += dt * (load - wall_push[0][side]) / servo[wp.static(MASS)]
+        push = wall_push[0]
+        is_low = servo[wp.static(SIDE)] == wp.float64(0.0)
+        u = servo[wp.static(INWARD)] * wp.where(is_low, v[0], v[1])
+        u += dt * (load - wp.where(is_low, push[0], push[1])) / servo[wp.static(MASS)]
         bound = servo[wp.static(BOUND)]
-        v[side] = servo[wp.static(INWARD)] * wp.clamp(u, -bound, bound)
-        wall_velocity[0] = v
+        u = servo[wp.static(INWARD)] * wp.clamp(u, -bound, bound)
+        wall_velocity[0] = wp.where(is_low, wp.vec2d(u, v[1]), wp.vec2d(v[0], u))
 
     return steer_wall

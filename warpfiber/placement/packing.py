@@ -38,8 +38,9 @@ from warpfiber.placement.populations import pack, population_report, populations
 from warpfiber.placement.relaxation import Freedom, relax
 from warpfiber.placement.shaped import insert_shaped
 from warpfiber.placement.shapes import straight_nodes
-from warpfiber.placement.space import Cell, Inserted
+from warpfiber.placement.space import Cell, Container, Inserted
 from warpfiber.scene import Fault, Scene, SceneError
+from warpfiber.scene.containers import container
 
 BATCH = 0.2
 """Part of all random fibers that goes in overlapping between two relaxations."""
@@ -96,7 +97,12 @@ def scene_cell(scene: Scene) -> Cell:
     if scene.box is None:
         return Cell(None, np.zeros(3, dtype=bool), np.zeros(3, dtype=bool))
     kinds = np.array(scene.box.boundary)
-    return Cell(np.array(scene.box.size, dtype=np.float64), kinds == "periodic", kinds == "wall")
+    size, found = np.array(scene.box.size, dtype=np.float64), container(scene)
+    around = None
+    if found is not None:
+        assert found.radius is not None and found.height is not None
+        around = Container(np.asarray(found.center), found.radius, found.height)
+    return Cell(size, kinds == "periodic", kinds == "wall", around)
 
 
 def overlap_of(
@@ -174,7 +180,7 @@ class _Packing:
     def insert_given(self) -> None:
         """Fibers with given centers; a direction in the way of another fiber is drawn again."""
         for g in self.groups:
-            if g.given is None:
+            if g.given is None or self.cell.container is not None:
                 continue
             for f in range(len(g.direction)):
                 draws = 0
@@ -197,9 +203,10 @@ class _Packing:
             self.held.append(g.capsules())
 
     def insert_shaped(self) -> None:
-        """Fibers that are not straight, as rigid bodies at free places."""
+        """Fibers that are not straight, or in a container, as rigid bodies at free places."""
         for g in self.groups:
-            if self.scene.fibers[g.index].shape.kind != "straight" and not g.nodes:
+            straight = self.scene.fibers[g.index].shape.kind == "straight"
+            if not g.nodes and (not straight or self.cell.container is not None):
                 self.held.append(insert_shaped(self.scene, self.cell, g, self.held, self.rng))
 
     def insert_random(self) -> None:

@@ -135,11 +135,23 @@ class _Places:
         low = np.where(wall, keep - turned.min(axis=0), 0.0)
         high = np.where(wall, size - keep - turned.max(axis=0), size)
         if given is not None:
-            inside = np.all((given >= low) & (given <= high) | ~wall)
+            inside = bool(np.all((given >= low) & (given <= high) | ~wall))
+            if inside and self.cell.container is not None:
+                inside = bool(self.cell.container.holds((turned + given)[None], self.radius)[0])
             return given[None] if inside else np.zeros((0, 3))
         if np.any(low > high):
             return np.zeros((0, 3))
-        return np.asarray(low + (high - low) * rng.random((TRIES, 3)))
+        around = self.cell.container
+        if around is not None:  # the box around it
+            half = np.array([around.radius, around.radius, 0.5 * around.height])
+            low, high = (
+                np.maximum(low, around.center - half),
+                np.minimum(high, around.center + half),
+            )
+        center = np.asarray(low + (high - low) * rng.random((TRIES, 3)))
+        if around is not None:
+            center = center[around.holds(turned + center[:, None], self.radius)]
+        return center
 
     def _free(self, turned: Floats, center: Floats) -> Floats | None:
         """Nodes of the first of these places that is free."""

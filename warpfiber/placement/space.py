@@ -18,6 +18,27 @@ CLEARANCE = 1e-3
 
 
 @dataclass(frozen=True)
+class Container:
+    """An upright cylinder around the fibers, all in m."""
+
+    center: Floats
+    """its middle, (3,)"""
+    radius: float
+    height: float
+
+    def holds(self, nodes: Floats, radius: float) -> NDArray[np.bool_]:
+        """Which fibers (m, nodes, 3) of this radius lie inside, free of its side, (m,)."""
+        away = nodes - self.center
+        across = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
+        along = np.abs(away[..., 2]).max(axis=1)
+        keep = wall_distance(radius)
+        held: NDArray[np.bool_] = np.logical_and(
+            across <= self.radius - keep, along <= 0.5 * self.height - keep
+        )
+        return held
+
+
+@dataclass(frozen=True)
 class Cell:
     """The space that fibers are placed in; size None: unbounded."""
 
@@ -25,6 +46,7 @@ class Cell:
     """m, (3,)"""
     periodic: NDArray[np.bool_]
     wall: NDArray[np.bool_]
+    container: Container | None = None
 
 
 def wall_distance(radius: float) -> float:

@@ -10,6 +10,7 @@ import math
 
 from warpfiber.scene.arrays import check_arrays
 from warpfiber.scene.availability import NOT_IN_METHOD, unavailable_in
+from warpfiber.scene.containers import check_containers
 from warpfiber.scene.derived import INERTIALESS, reach
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
@@ -50,6 +51,7 @@ def cross_check(draft: Draft) -> None:
     _check_rest(draft)
     _check_record(draft)
     check_arrays(draft)
+    check_containers(draft)
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)

@@ -75,6 +75,7 @@ def take_start(draft: Draft) -> None:
     _choose_stage(draft, start, folder)
     draft.saved = saved
     draft.box = None if saved.box is None else dict(vars(saved.box))
+    draft.walls = [dict(vars(wall)) for wall in saved.walls]
     draft.fibers = [vars(group) | {"shape": dict(vars(group.shape))} for group in saved.fibers]
     _keep_numerics(draft, saved)
 
