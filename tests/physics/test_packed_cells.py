@@ -3,7 +3,7 @@
 Source: a fiber that springs back without contact leaves every row made for that motion behind; with
 the forces of the last step on it a step is as long as the motion of the cell allows.
 Tolerance: forces on nodes are sums of the rows' to rounding; a step is halved for an overlap of
-more than 0.05 radii, or 20 tolerances of contact.
+more than 0.05 radii, or 50 tolerances of contact.
 """
 
 from __future__ import annotations
