@@ -19,6 +19,7 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.methods.pair_search import PairSearch
+from warpfiber.methods.skin import MOST_SKIN
 from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import ContactRows
@@ -38,7 +39,8 @@ BENT = 0.1  # radii: nodes of such a fiber are farther than that from the line b
 # Radii: a step that ends with more is repeated by half. Rods hardly ever reach theirs, which costs
 # some steps in a thousand; flexible fibers would be halved often.
 OVERLAP, OVERLAP_RODS = 0.05, 0.03
-SLACK = 20.0  # tolerances of contact: or with more than these
+SLACK, SLACK_BENT = 20.0, 50.0  # tolerances of contact: or with more than these
+SKIN_BENT = 3.0  # diameters, where a few fibers of many spring farther than the others
 # Parts of the first step that no list lasts, below which a step is not worth taking: with a given
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
@@ -128,14 +130,23 @@ class ImplicitContact:
         self.hard = scene.numerics.contact == "unilateral"
         tolerance = scene.numerics.contact_tolerance or 1e-3
         least = OVERLAP_RODS if scene.numerics.method == "rigid_rod" else OVERLAP
-        self.overlap = max(least, SLACK * tolerance) if self.hard else FINITE
         radii = [row["radius"] for row in model.group_rows]
         self.packed = largest_bend(model, state) > BENT * min(radii)
+        slack = SLACK_BENT if self.packed else SLACK
+        self.overlap = max(least, slack * tolerance) if self.hard else FINITE
         keep = KEEP_BENT if self.packed else KEEP
         reach = 2.0 * max(radii) + keep * min(radii)
         if scene.contact.lubrication != "none":
             reach = max(reach, OUTER * 2.0 * max(radii))
-        self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
+        self.search = PairSearch(
+            scene,
+            model,
+            state,
+            reach=reach,
+            stretch=stretch,
+            workers=workers,
+            most_skin=SKIN_BENT if self.packed else MOST_SKIN,
+        )
         self.solves: list[tuple[ContactRows, ContactDual]] = []
         for again in range(scene.numerics.linearizations or 1):
             lattice = step.ends_lattice
