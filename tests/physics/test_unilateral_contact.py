@@ -386,32 +386,3 @@ def test_exponential_rows_obey_their_law(meeting: Meeting, method: str) -> None:
     assert np.abs(gap - expected).max() < 1e2 * SOLVED
     apart = left_over(sim, (found["force"] == 0.0) & (found["j"] >= 0))
     assert apart.min() > 1e-3 - 1e2 * SOLVED
-
-
-# -- order in dt ----------------------------------------------------------------------------------
-
-LAWS: dict[str, dict[str, Any]] = {
-    "hard": {},
-    "lubrication": {"contact": HARD | {"lubrication": "paper"}},
-    "penalty": {"contact": {"law": "linear", "stiffness": 3e3}},
-}
-
-
-@pytest.mark.parametrize("name", LAWS)
-@pytest.mark.parametrize("method", ["rigid_rod", "overdamped"])
-def test_contact_is_of_first_order(meeting: Meeting, method: str, name: str) -> None:
-    """Median over all nodes of a cell: contacts that open or slip by decide on the largest."""
-    ends = []
-    for dt in (0.1, 0.05, 0.025, 0.003125):
-        numerics: dict[str, Any] = {"dt": dt, "contact_tolerance": 1e-5}
-        if name == "penalty":
-            numerics["contact"] = "penalty"
-        box = {"size": [34.0, 34.0, 34.0]}
-        sim = meeting(method, 75, box=box, numerics=numerics, **LAWS[name])
-        sim.step(round(2.0 / dt))
-        assert sim.strain == pytest.approx(2.0, rel=1e-9)
-        ends.append(sim.node_pos)
-    errors = [float(np.median(np.abs(end - ends[-1]))) for end in ends[:-1]]
-    # (0.1 - 0.003)/(0.05 - 0.003) = 2.07 and 2.14 but for the few contacts that bifurcate
-    for large, small in zip(errors, errors[1:], strict=False):
-        assert 1.6 < large / small < 3.2

@@ -126,7 +126,8 @@ class ImplicitContact:
         tolerance = scene.numerics.contact_tolerance or 1e-3
         self.overlap = max(OVERLAP, SLACK * tolerance) if self.hard else FINITE
         radii = [row["radius"] for row in model.group_rows]
-        keep = KEEP_BENT if largest_bend(model, state) > BENT * min(radii) else KEEP
+        self.packed = largest_bend(model, state) > BENT * min(radii)
+        keep = KEEP_BENT if self.packed else KEEP
         reach = 2.0 * max(radii) + keep * min(radii)
         if scene.contact.lubrication != "none":
             reach = max(reach, OUTER * 2.0 * max(radii))

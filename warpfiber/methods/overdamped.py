@@ -21,6 +21,7 @@ from warpfiber.methods.implicit import Implicit, Launches
 from warpfiber.methods.loads import node_loads
 from warpfiber.model import Model, State
 from warpfiber.passes.chain_load import ChainLoad
+from warpfiber.passes.chain_pace import make_chain_pace
 from warpfiber.passes.chain_response import ChainResponse
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
@@ -56,11 +57,15 @@ class Overdamped(Implicit):
         self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=device)
         # the guess of the first step is the start: nothing is known of the velocity
         state.node_velocity.zero_()
+        self.fiber_pace = wp.full(model.fiber_count, p.real(1.0), p.real, device=device)
         self.load: ChainLoad | None = None
         if self.meets:
-            response = ChainResponse(model, self.rows, self.row_stride, self.tension)
+            response = ChainResponse(
+                model, self.rows, self.row_stride, self.tension, fiber_pace=self.fiber_pace
+            )
             self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
             self._make_contact(response, self.load)
+        self.paced = self.contact is not None and self.contact.packed
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -70,6 +75,8 @@ class Overdamped(Implicit):
 
     def _motion(self, stages: int) -> Launches:
         found: Launches = [self._solve(stages)]
+        if self.paced:
+            found += [self._set_pace(), self._solve(stages, again=True)]
         if any(group.frozen for group in self.scene.fibers):
             found.append(self._carry())
         if self.load is not None:
@@ -84,7 +91,7 @@ class Overdamped(Implicit):
         """Tensions now and at the start of the step."""
         return self.tension, self.tension_back
 
-    def _solve(self, stages: int) -> Launch:
+    def _solve(self, stages: int, again: bool = False) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
         hold, given = self.node_hold, self.node_load
         if self.load is not None:
@@ -92,9 +99,13 @@ class Overdamped(Implicit):
         inputs = [
             stages,
             (2 if self.adaptive else 1) if self.keeps else 0,
+            1 if again else 0,
+            # packed fibers near the load at which they buckle would answer contact without bounds
+            1 if self.contact is not None and self.contact.packed else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
+            self.fiber_pace,
             self.stage_gradient,
             model.groups,
             model.fiber_node_start,
@@ -116,7 +127,31 @@ class Overdamped(Implicit):
         ]
         held = self.node_hold.shape[0] > 0
         kernel = make_chain_step(p.name, hold.shape[0] > 0, held and model.domain.sheared)
-        return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
+        name = "fibers_again" if again else "fibers"
+        return Launch(name, kernel, model.fiber_count, inputs, split=True, follows=again)
+
+    def _set_pace(self) -> Launch:
+        model, state, p = self.model, self.state, self.model.precision
+        assert self.load is not None
+        inputs = [
+            p.vec3(*self.flow_origin),
+            state.deformation,
+            self.deformation_next,
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            self.load.step_hold,
+            self.node_back,
+            self.velocity_back,
+            self.tension_back,
+            state.status,
+            state.node_pos,
+            state.node_velocity,
+            self.tension,
+            self.fiber_pace,
+        ]
+        kernel = make_chain_pace(p.name)
+        return Launch("set_pace", kernel, model.fiber_count, inputs, split=True, follows=True)
 
     def _carry(self) -> Launch:
         model, state = self.model, self.state

@@ -138,6 +138,7 @@ def make_chain_moves(name: str, has_frozen: bool):
         offset: wp.int32,
         row_stride: wp.int32,
         step_size: wp.array(dtype=wp.float64),
+        fiber_pace: wp.array(dtype=real),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -190,7 +191,7 @@ def make_chain_moves(name: str, has_frozen: bool):
         owned = row_out_start[first - fiber + segments] - row_out_start[first - fiber]
         g = groups[fiber_group[fiber]]
         base = row_stride * fiber
-        dt = real(step_size[0])
+        dt = fiber_pace[fiber] * real(step_size[0])
         column = block_start[fiber]
         if column < 0:
             gather_push(

@@ -46,10 +46,12 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         node_hold: wp.array(dtype=wp.uint8),
         node_load: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=vec3),
+        fiber_pace_out: wp.array(dtype=real),
         step_load_out: wp.array(dtype=vec3),
     ):
         """Loads of scene and contact together; of a held node the velocity that it is given."""
         fiber = wp.tid() + offset
+        fiber_pace_out[fiber] = one
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
             if wp.static(loaded):
                 given = node_load[i]
@@ -64,6 +66,7 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         offset: wp.int32,
         row_stride: wp.int32,
         step_size: wp.array(dtype=wp.float64),
+        fiber_pace: wp.array(dtype=real),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -95,12 +98,13 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
             if wp.int32(node_hold[first]) == wp.static(FROZEN):
                 return
         dt = real(step_size[0])
+        h_force = chi * dt * fiber_pace[fiber]
         chain_reply(
             fiber,
             first,
             segments,
             row_stride * fiber,
-            dt,
+            fiber_pace[fiber] * dt,
             groups[fiber_group[fiber]],
             rows,
             contact_load,
@@ -114,7 +118,7 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
             node_velocity[i] = node_velocity[i] - node_shift[i] / dt
             if i < first + segments:
                 segment = i - fiber
-                tension[segment] = tension[segment] - segment_impulse[segment] / (chi * dt)
+                tension[segment] = tension[segment] - segment_impulse[segment] / h_force
 
     @wp.kernel(**options)
     def note_load(
@@ -222,8 +226,9 @@ class ChainLoad:
         return Launch(name, self.kernels[name], fibers, inputs, split=True, follows=follows)
 
     def lay_on(self) -> Launch:
-        """Before the motion: loads of scene and contact together."""
-        inputs = [self.node_hold, self.node_load, self.contact_load, self.step_load]
+        """Before the motion: loads of scene and contact together, every fiber at full pace."""
+        given = [self.node_hold, self.node_load, self.contact_load]
+        inputs = [*given, self.response.fiber_pace, self.step_load]
         return self._launch("lay_on", [self.model.fiber_node_start, *inputs])
 
     def take_off(self, step_size: Any) -> Launch:
@@ -232,6 +237,7 @@ class ChainLoad:
         inputs = [
             response.row_stride,
             step_size,
+            response.fiber_pace,
             model.groups,
             model.fiber_node_start,
             model.fiber_group,

@@ -40,6 +40,7 @@ def make_chain_response(name: str, has_frozen: bool, module: str = "unique") -> 
         offset: wp.int32,
         row_stride: wp.int32,
         step_size: wp.array(dtype=wp.float64),
+        fiber_pace: wp.array(dtype=real),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -93,7 +94,7 @@ def make_chain_response(name: str, has_frozen: bool, module: str = "unique") -> 
             first,
             segments,
             row_stride * fiber,
-            real(step_size[0]),
+            fiber_pace[fiber] * real(step_size[0]),
             groups[fiber_group[fiber]],
             rows,
             node_push,
@@ -121,6 +122,7 @@ def make_chain_apply(name: str, module: str = "unique") -> Any:
         offset: wp.int32,
         carried: real,
         step_size: wp.array(dtype=wp.float64),
+        fiber_pace: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
         end_start: wp.array(dtype=wp.int32),
         node_shift: wp.array(dtype=vec3),
@@ -141,6 +143,7 @@ def make_chain_apply(name: str, module: str = "unique") -> Any:
                 segment_shift[i - fiber] = real(0.0)
             return
         dt = real(step_size[0])
+        h_force = chi * dt * fiber_pace[fiber]
         behind = real(0.0)
         for i in range(first, last + 1):
             moved = wp.length(node_shift[i])
@@ -150,7 +153,7 @@ def make_chain_apply(name: str, module: str = "unique") -> Any:
             node_pos[i] = node_pos[i] + node_shift[i]
             node_velocity[i] = node_velocity[i] + (carried / dt) * node_shift[i]
             if i < last:
-                tension[i - fiber] = tension[i - fiber] + segment_impulse[i - fiber] / (chi * dt)
+                tension[i - fiber] = tension[i - fiber] + segment_impulse[i - fiber] / h_force
 
     return chain_apply
 
@@ -160,6 +163,7 @@ class ChainResponse:
 
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
     block_share: numbers per end in `block`, the ends that a fiber may have on average.
+    fiber_pace: see `chain_pace`; 1 unless given.
     """
 
     by_ends = True
@@ -171,12 +175,15 @@ class ChainResponse:
         row_stride: int,
         tension: Any,
         block_share: int | None = None,
+        fiber_pace: Any = None,
     ) -> None:
         most = max(row["segments"] for row in model.group_rows)
         self.relaxes = model.device.startswith("cpu") and most < MOST_NODES
         self.block_share = block_share
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
+        ones = wp.full(model.fiber_count, p.real(1.0), p.real, device=model.device)
+        self.fiber_pace = ones if fiber_pace is None else fiber_pace
         self.node_push = self._array(nodes, p.vec3)
         self.node_reply = self._array(nodes, p.vec3)
         self.reply_impulse = self._array(nodes, p.real)
@@ -231,6 +238,7 @@ class ChainResponse:
         return [
             self.row_stride,
             dual.step_size,
+            self.fiber_pace,
             model.groups,
             model.fiber_node_start,
             model.fiber_group,
@@ -308,6 +316,7 @@ class ChainResponse:
             law.stiffness,
             law.decay,
             dual.step_size,
+            self.fiber_pace,
             model.groups,
             model.fiber_node_start,
             model.fiber_group,
@@ -342,6 +351,7 @@ class ChainResponse:
         inputs = [
             carried,
             dual.step_size,
+            self.fiber_pace,
             model.fiber_node_start,
             self.end_start,
             dual.node_shift,

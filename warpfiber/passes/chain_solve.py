@@ -5,17 +5,15 @@ Source: linearly implicit steps of (R + T) v = R u + F_Omega - B x + F_lambda wi
     the segment before it, C = 1/(h k_s) (0: inextensible):
         K_0 delta + G^T Lambda = r_0,  G delta - C Lambda = l - L*
     Block LDL^T of 4x4 blocks in this order; the second lower block is kappa I on the displacements.
-    SDIRK2 (chi = 1 - 1/sqrt 2) takes two solves, BDF2 one. The guess is x* = x + a m and the base
-    x* - b m with a motion m:
+    SDIRK2 (chi = 1 - 1/sqrt 2) takes two solves. Guess x* = x + a m, base x* - b m, a motion m:
         BDF2      h = 2/3 dt   a = 1      b = 2/3  m = last displacement    lambda* extrapolated
         SDIRK2 1  h = chi dt   a = h      b = h    m = last velocity        lambda* of the start
         SDIRK2 2  h = chi dt   a = 1/chi  b = 1    m = X_1 - x              lambda* of stage 1
 Symbols: W lower block of a row as rows w0, w1, w2 and column wt of the impulse; L = W D^-1 alike;
     D^-1 = [[P, q], [q^T, s]], P symmetric as diagonal (xx, yy, zz) and off (xy, xz, yz).
-    A held node has a known delta_i = h V - w: its inverse block keeps the impulse alone, exactly
-    what an endless drag would leave.
+    A held node has delta_i = h V - w: its inverse block keeps the impulse alone.
 Limits: a pivot that is not positive (compression buckles within a step) repeats the solve without
-    the negative tensions in the matrix: the same order, damped.
+    the negative tensions in the matrix: the same order, damped. `clips`: always without them.
 """
 
 import math
@@ -43,9 +41,8 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
 
     `loaded`: nodes have a force or, as `node_hold` says, a velocity in `node_load`, and frozen
     fibers are left to `carry_fibers`; `sheared`: stored images move with the flow.
-
-    `keeps`: steps may be rejected, so the state of the start is kept (1, 2); a tear is left to the
-    error (2).
+    `keeps`: the state of the start is kept (1, 2); a tear is left to the error (2).
+    `fiber_pace`: see `chain_pace`; `again`: only fibers of less than 1; `clips`: see Limits.
     `row_stride`: rows per fiber in `rows`; negative if all fibers of a launch share the first's.
     """
     p = precision(name)
@@ -66,9 +63,12 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
         offset: wp.int32,
         stages: wp.int32,
         keeps: wp.int32,
+        again: wp.int32,
+        clips: wp.int32,
         row_stride: wp.int32,
         flow_origin: vec3,
         step_size: wp.array(dtype=wp.float64),
+        fiber_pace: wp.array(dtype=real),
         stage_gradient: wp.array(dtype=mat33),
         groups: wp.array(dtype=Group),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -95,6 +95,9 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
         first = fiber_node_start[fiber]
         segments = g.segments
         dt = real(step_size[0])
+        pace = fiber_pace[fiber]
+        if again != 0 and pace == one:
+            return
         # Rows of this fiber; where the fibers of a launch run one after the other they share them.
         base = wp.abs(row_stride) * offset
         if row_stride > 0:
@@ -107,7 +110,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
         drag_off = g.drag * g.coupling
         nothing = vec3(zero, zero, zero)
         stage = wp.int32(0)
-        clipped = wp.int32(0)
+        clipped = clips
         while stage < stages:
             from_velocity = stages == 2 and stage == 0
             h = two_thirds * dt
@@ -123,12 +126,11 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
             gradient = stage_gradient[stage + 2 - stages]
             spin = h * flow_spin(gradient)
             settling = (h / g.drag) * g.body_force
-            kappa = h * g.bending / (g.rest * g.rest)
-            compliance = g.compliance / h
-
-            # Forward. At node k the guess of the nodes k, k + 1, k + 2 is known: x0, x1, x2; w is
-            # the guess minus the base, e = h (u + settling) - w, edge = x1 - x0, c the second
-            # difference of the guess.
+            h_force = pace * h
+            kappa = h_force * g.bending / (g.rest * g.rest)
+            compliance = g.compliance / h_force
+            # Forward. x0, x1, x2: guess of the nodes k, k + 1, k + 2; w: the guess minus the base;
+            # e = h (u + settling) - w, edge = x1 - x0, c the second difference of the guess.
             m0 = node_motion[first]
             m1 = node_motion[first + 1]
             if from_velocity:
@@ -190,7 +192,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                     if clipped != 0:
                         pull = wp.max(pull, zero)
                     strength = g.torque * weight
-                    rho = turning_resistance(strength, inverse, pull, h)
+                    rho = turning_resistance(strength, inverse, pull, h_force)
                     couple = torque_couple(strength, n, inverse, w1 - w0, spin)
                     gap = g.rest - d
                     e_after = e1
@@ -204,16 +206,14 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                         edge_after = x2 - x1
                         c_after = edge_after - edge
 
-                drag = drag_inner
-                if k == 0 or k == segments:
-                    drag = drag_end
+                drag = wp.where(k == 0 or k == segments, drag_end, drag_inner)
                 bend = bending_entries(k, segments)
                 r = drag * e0 + drag_off * (e_before + e_after)
                 r += couple_before - couple
                 r -= kappa * (c_before - two * c_here + c_after)
                 if wp.static(loaded):
                     if wp.int32(node_hold[i]) == wp.static(FREE):
-                        r += h * node_load[i]
+                        r += h_force * node_load[i]
 
                 # W and L
                 off = drag_off + kappa * bend[1] - rho_before
@@ -363,7 +363,7 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                         segment = i - fiber - 1
                         if stage == 0:
                             tension_back[segment] = tension[segment]
-                        tension[segment] = impulse / h
+                        tension[segment] = impulse / h_force
                     m = node_motion[i]
                     if from_velocity:
                         m = node_velocity[i]
@@ -394,6 +394,6 @@ def make_chain_step(name: str, loaded: bool = False, sheared: bool = False):
                             status[wp.static(BAD_FIBER)] = fiber
                     fiber_error[fiber] = error
                 stage += 1
-                clipped = 0
+                clipped = clips
 
     return chain_step

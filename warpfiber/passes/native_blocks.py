@@ -20,7 +20,9 @@ FILL_BLOCK = """
         const int base = row_stride * f, count = end_start.data[f + 1] - end_start.data[f];
         const int owned = row_last(f) - row_first(f), of = fiber_group.data[f];
         const T* const number = numbers.data + 6 * of;
-        const T h = number[0], kappa = number[1], drag_end = number[2], drag_inner = number[3];
+        const T pace = fiber_pace.data[f];
+        const T h = pace * number[0], kappa = pace * number[1];
+        const T drag_end = number[2], drag_inner = number[3];
         const T drag_off = number[4], strength = number[5];
         const T weight = groups.data[of].weight, weight_excess = groups.data[of].weight_excess;
         V3 z[MOST_NODES];
