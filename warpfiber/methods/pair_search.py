@@ -28,8 +28,8 @@ SPARE = 1.1
 class PairSearch:
     """Neighbor list and skin; lengths in run units.
 
-    `most_skin`: largest skin, diameters. `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
-    of one more listed pair, see `skin.PAIR_COST`.
+    `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
+    of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters.
     """
 
     def __init__(
