@@ -35,7 +35,6 @@ KEEP = 0.3
 # Radii: the same in a cell whose fibers are bent from the start, as packed ones are. Others hold
 # them, and where a contact opens or closes they move on by more.
 KEEP_BENT = 1.0
-BENT = 0.1  # radii: nodes of such a fiber are farther than that from the line between its ends
 # Radii: a step that ends with more is repeated by half. Rods hardly ever reach theirs, which costs
 # some steps in a thousand; flexible fibers would be halved often.
 OVERLAP, OVERLAP_RODS = 0.05, 0.03
@@ -81,19 +80,6 @@ def has_contact(scene: Scene) -> bool:
     return scene.contact.law != "none" or scene.contact.lubrication != "none"
 
 
-def largest_bend(model: Model, state: State) -> float:
-    """Largest distance of a node from the line between the ends of its fiber, run units."""
-    start = model.host["fiber_node_start"]
-    nodes = state.node_pos.numpy().astype(float)
-    counts = np.diff(start)
-    first = np.repeat(nodes[start[:-1]], counts, axis=0)
-    span = np.repeat(nodes[start[1:] - 1], counts, axis=0) - first
-    length2 = np.einsum("ij,ij->i", span, span)
-    along = np.einsum("ij,ij->i", nodes - first, span) / np.where(length2 > 0.0, length2, 1.0)
-    away = np.linalg.norm(nodes - first - along[:, None] * span, axis=1)
-    return float(away.max())
-
-
 def contact_law(scene: Scene, model: Model) -> ContactLaw:
     """The law of contacts in run units."""
     contact, units = scene.contact, model.units
@@ -131,7 +117,7 @@ class ImplicitContact:
         tolerance = scene.numerics.contact_tolerance or 1e-3
         least = OVERLAP_RODS if scene.numerics.method == "rigid_rod" else OVERLAP
         radii = [row["radius"] for row in model.group_rows]
-        self.packed = largest_bend(model, state) > BENT * min(radii)
+        self.packed = model.starts_bent
         slack = SLACK_BENT if self.packed else SLACK
         self.overlap = max(least, slack * tolerance) if self.hard else FINITE
         keep = KEEP_BENT if self.packed else KEEP
@@ -264,6 +250,7 @@ class ImplicitContact:
         """What the next step depends on: list, skin and the forces of the last rows."""
         arrays = self.search.saved()
         arrays["list_share"] = self.check.share_back.numpy().copy()
+        arrays["starts_bent"] = np.asarray([self.packed])
         for number, (rows, _) in enumerate(self.solves):
             arrays |= {f"rows{number}_{key}": value for key, value in rows.saved().items()}
         return arrays
