@@ -22,28 +22,32 @@ import numpy as np
 
 import warpfiber as wf
 from warpfiber.methods import bonded_spheres
+from warpfiber.placement import Placement
 from warpfiber.scene import scene_from_dict
 
 EDGE, SPEED = 0.06, 0.1  # m, m/s
+TILE = 500  # fibers that are settled; larger beds are periodic copies side by side
 SETTLING = 0.5  # s
 PLACED = 0.1  # volume fraction of the fibers as they are placed
 
 
-def bed_tables(fibers: int, fraction: float, precision: str) -> dict[str, Any]:
-    """Straight fibers of Xu et al. (2023), Table 2, 500 of them on 60 mm x 60 mm."""
-    edge = EDGE * max(1.0, (fibers / 500.0) ** 0.5)
+def bed_tables(
+    fibers: int, fraction: float, precision: str, copies: tuple[int, int] = (1, 1)
+) -> dict[str, Any]:
+    """Straight fibers of Xu et al. (2023), Table 2, on 60 mm x 60 mm, copied along x and y."""
     volume = fibers * 0.06283 * np.pi * 1.2e-3**2
+    height = float(volume / (PLACED * EDGE * EDGE))
     plate = {"kind": "compress", "wall": "z+", "speed": SPEED, "time_limit": 10.0}
     return {
         "title": "settled bed under a plate",
         "box": {
-            "size": [edge, edge, float(volume / (PLACED * edge * edge))],
+            "size": [EDGE * copies[0], EDGE * copies[1], height],
             "boundary": ["periodic", "periodic", "wall"],
         },
         "gravity": {},
         "fibers": [
             {
-                "count": fibers,
+                "count": fibers * copies[0] * copies[1],
                 "centerline_length": 0.06283,
                 "diameter": 2.4e-3,
                 "density": 1340.0,
@@ -87,6 +91,46 @@ def settled_bed(
     return simulation, prepared
 
 
+def tiled_bed(
+    small: wf.Simulation, tables: Mapping[str, Any], copies: tuple[int, int], **options: Any
+) -> wf.Simulation:
+    """Copies of a settled bed side by side, without the memories of its contacts."""
+    count, model = copies[0] * copies[1], small.model
+    shifts = EDGE * np.array([[x, y, 0.0] for x in range(copies[0]) for y in range(copies[1])])
+    nodes = (small.node_pos[None] + shifts[:, None]).reshape(-1, 3)
+    per_fiber = np.tile(np.diff(small.fiber_node_start), count)
+    starts = np.concatenate([[0], np.cumsum(per_fiber)]).astype(np.int32)
+    group = np.zeros(len(per_fiber), dtype=np.int32)
+    big = wf.Simulation(
+        scene_from_dict(tables), placement=Placement(nodes, starts, group), dt=small.dt, **options
+    )
+    mine, arrays = small.snapshot(), big.snapshot()
+    ratio = big.model.node_count // model.node_count
+    for name, values in mine.items():
+        if name.startswith(("contact_", "near_")) or name not in arrays or values.ndim == 0:
+            continue
+        if len(arrays[name]) == ratio * len(values) and len(values) >= model.fiber_count:
+            arrays[name] = np.tile(values, (ratio,) + (1,) * (values.ndim - 1))
+    for name in ("node_pos", "list_pos", "bonds_place"):
+        shift = np.repeat(shifts, model.node_count, axis=0) / model.units.length
+        arrays[name] = (np.tile(mine["bonds_place"], (ratio, 1)) + shift).astype(arrays[name].dtype)
+    arrays["press_place"] = mine["press_place"].copy()
+    arrays["press_place"][1, :2] *= copies
+    for name in ("near_pos", "near_skin"):
+        arrays.pop(name, None)
+    for name in ("contact_acts", "contact_memory", "contact_written"):
+        arrays[name] = arrays[name][:0]
+    big.restore(arrays)
+    return big
+
+
+def copies_of(fibers: int) -> tuple[int, int]:
+    """Numbers of tiles along x and y, as square as they can be."""
+    tiles = max(1, round(fibers / TILE))
+    along = max(n for n in range(1, int(tiles**0.5) + 1) if tiles % n == 0)
+    return tiles // along, along
+
+
 def run_stage(simulation: wf.Simulation, stage: Any) -> None:
     """Run a stage from now to its end."""
     start = (0.0, simulation.time)
@@ -103,9 +147,17 @@ def dem_rows(
     bonded_spheres.NATIVE = not args.plain
     for precision in args.precisions:
         for fibers in args.fibers:
-            tables = bed_tables(fibers, args.fraction, precision)
             options = {"device": args.device, "workers": args.workers}
+            copies = copies_of(fibers)
+            tile = min(fibers, TILE)
+            tables = bed_tables(tile, args.fraction, precision)
             simulation, prepared = settled_bed(tables, folder, **options)
+            if copies != (1, 1):
+                small, tables = simulation, bed_tables(tile, args.fraction, precision, copies)
+                simulation = tiled_bed(small, tables, copies, **options)
+                small.close()
+                simulation.begin_stage(simulation.scene.stage_sequence[-1])
+                simulation.step(200)  # contacts find their memories again
             row = common(simulation) | {"bench": "dem", "seconds_to_prepare": round(prepared, 2)}
             if args.load:
                 yield row | load_time(simulation)

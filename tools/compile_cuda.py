@@ -36,6 +36,8 @@ from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
 from warpfiber.passes.capsule_pairs import CapsuleFeatures, make_capsule_pairs
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
+from warpfiber.passes.chain_load import make_chain_load
+from warpfiber.passes.chain_pace import make_chain_pace
 from warpfiber.passes.chain_response import make_chain_apply, make_chain_response
 from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
@@ -226,6 +228,9 @@ def _dual_kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "chain_moves", "", make_chain_moves(precision, False)
     yield "chain_response", "", make_chain_response(precision, False)
     yield "chain_apply", "", make_chain_apply(precision)
+    yield "set_pace", "", make_chain_pace(precision)
+    for name, kernel in make_chain_load(precision, True).items():
+        yield name, "", kernel
 
 
 def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:

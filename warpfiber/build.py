@@ -26,6 +26,7 @@ from warpfiber.model import (
 )
 from warpfiber.passes.precision import group_struct
 from warpfiber.placement import Placement, place_fibers, split_tables
+from warpfiber.placement.bend import BENT, largest_bend
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.arrays import wall_arrays
 from warpfiber.scene.derived import INERTIALESS
@@ -224,6 +225,7 @@ def build(
         fiber_count=fiber_count,
         node_count=node_count,
         segment_count=len(segment_fiber),
+        starts_bent=_starts_bent(scene, placement),
         host=host,
     )
     state = make_state(model)
@@ -232,6 +234,13 @@ def build(
     state.node_velocity.assign(velocity.astype(p.numpy))
     state.list_pos.assign(state.node_pos)
     return model, state, placement.report
+
+
+def _starts_bent(scene: Scene, placement: Placement) -> bool:
+    if placement.starts_bent is not None:
+        return placement.starts_bent
+    bend = largest_bend(placement.node_pos, placement.fiber_node_start)
+    return bend > BENT * min(group.radius for group in scene.fibers)
 
 
 def make_state(model: Model) -> State:

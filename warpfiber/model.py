@@ -145,6 +145,7 @@ class Model:
     fiber_count: int
     node_count: int
     segment_count: int
+    starts_bent: bool = False  # whether some fiber was bent when the run began, as packed ones are
     host: dict[str, np.ndarray] = field(default_factory=dict)  # NumPy copies of the index arrays
 
 

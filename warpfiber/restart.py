@@ -56,5 +56,6 @@ def _restart(path: Path, arrays: dict[str, np.ndarray], attrs: dict[str, Any]) -
         fiber_node_start=arrays["fiber_node_start"],
         fiber_group=arrays["fiber_group"],
         report={},
+        starts_bent=bool(arrays["starts_bent"][0]) if "starts_bent" in arrays else None,
     )
     return Restart(path, arrays, attrs, scene, fibers, placement)

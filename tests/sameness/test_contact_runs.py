@@ -97,7 +97,7 @@ def test_restore_after_halved_steps(meeting: Meeting) -> None:
     keys = RUNS["too large steps"]
     run = meeting("rigid_rod", **keys)
     states = []
-    for _ in range(12):
+    for _ in range(30):
         run.step()
         states.append(run.snapshot())
     sizes = {float(state["implicit_step_size"][0]) for state in states}

@@ -6,8 +6,6 @@ Tolerance: the motion of a slowed fiber is that of one whose forces are so much 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -94,9 +92,9 @@ def test_pace_is_a_softer_fiber() -> None:
 def test_bend_goes_in_the_end(modulus: float) -> None:
     """Slower, but the fiber straightens; a stiff one at once, whatever its pace."""
     sim = spring(modulus, [12.0])
-    before: Any = bend(sim, 0)
-    for _ in range(5):
+    before = abs(bend(sim, 0))
+    for _ in range(3):
         sim.step(1)
-        assert bend(sim, 0) < before
-        before = bend(sim, 0)
+        assert abs(bend(sim, 0)) < before
+        before = abs(bend(sim, 0))
     sim.close()

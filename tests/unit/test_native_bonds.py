@@ -158,6 +158,9 @@ def check_pairs(sim: Simulation, precision: str) -> None:
     np.testing.assert_array_equal(found["acts"], expected["acts"])
     if contacts.features.friction:
         np.testing.assert_array_equal(found["written"], expected["written"])
+    kept = "memory" if contacts.features.friction else "force"
+    sides = [pairs[kept][..., touching, :] for pairs in (found, expected)]
+    assert np.abs(sides[0] - sides[1]).max() < 10.0 * PAIR_BOUND[precision] * np.abs(sides[1]).max()
     for name in ("force", "moment", "arms"):
         # moments are in forces: those of a radius
         scale = np.abs(expected["arms" if name == "arms" else "force"][touching]).max()

@@ -19,6 +19,7 @@ import warp as wp
 
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.methods.pair_search import PairSearch
+from warpfiber.methods.skin import MOST_SKIN
 from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import ContactRows
@@ -34,9 +35,11 @@ KEEP = 0.3
 # Radii: the same in a cell whose fibers are bent from the start, as packed ones are. Others hold
 # them, and where a contact opens or closes they move on by more.
 KEEP_BENT = 1.0
-BENT = 0.1  # radii: nodes of such a fiber are farther than that from the line between its ends
-OVERLAP = 0.05  # radii: a step that ends with more is repeated by half
-SLACK = 20.0  # tolerances of contact: or with more than these
+# Radii: a step that ends with more is repeated by half. Rods hardly ever reach theirs, which costs
+# some steps in a thousand; flexible fibers would be halved often.
+OVERLAP, OVERLAP_RODS = 0.05, 0.03
+SLACK, SLACK_BENT = 20.0, 50.0  # tolerances of contact: or with more than these
+SKIN_BENT = 3.0  # diameters, where a few fibers of many spring farther than the others
 # Parts of the first step that no list lasts, below which a step is not worth taking: with a given
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
@@ -77,19 +80,6 @@ def has_contact(scene: Scene) -> bool:
     return scene.contact.law != "none" or scene.contact.lubrication != "none"
 
 
-def largest_bend(model: Model, state: State) -> float:
-    """Largest distance of a node from the line between the ends of its fiber, run units."""
-    start = model.host["fiber_node_start"]
-    nodes = state.node_pos.numpy().astype(float)
-    counts = np.diff(start)
-    first = np.repeat(nodes[start[:-1]], counts, axis=0)
-    span = np.repeat(nodes[start[1:] - 1], counts, axis=0) - first
-    length2 = np.einsum("ij,ij->i", span, span)
-    along = np.einsum("ij,ij->i", nodes - first, span) / np.where(length2 > 0.0, length2, 1.0)
-    away = np.linalg.norm(nodes - first - along[:, None] * span, axis=1)
-    return float(away.max())
-
-
 def contact_law(scene: Scene, model: Model) -> ContactLaw:
     """The law of contacts in run units."""
     contact, units = scene.contact, model.units
@@ -125,14 +115,24 @@ class ImplicitContact:
         self.response, self.load, self.flow_origin = response, load, flow_origin
         self.hard = scene.numerics.contact == "unilateral"
         tolerance = scene.numerics.contact_tolerance or 1e-3
-        self.overlap = max(OVERLAP, SLACK * tolerance) if self.hard else FINITE
+        least = OVERLAP_RODS if scene.numerics.method == "rigid_rod" else OVERLAP
         radii = [row["radius"] for row in model.group_rows]
-        self.packed = largest_bend(model, state) > BENT * min(radii)
+        self.packed = model.starts_bent
+        slack = SLACK_BENT if self.packed else SLACK
+        self.overlap = max(least, slack * tolerance) if self.hard else FINITE
         keep = KEEP_BENT if self.packed else KEEP
         reach = 2.0 * max(radii) + keep * min(radii)
         if scene.contact.lubrication != "none":
             reach = max(reach, OUTER * 2.0 * max(radii))
-        self.search = PairSearch(scene, model, state, reach=reach, stretch=stretch, workers=workers)
+        self.search = PairSearch(
+            scene,
+            model,
+            state,
+            reach=reach,
+            stretch=stretch,
+            workers=workers,
+            most_skin=SKIN_BENT if self.packed else MOST_SKIN,
+        )
         self.solves: list[tuple[ContactRows, ContactDual]] = []
         for again in range(scene.numerics.linearizations or 1):
             lattice = step.ends_lattice
@@ -250,6 +250,7 @@ class ImplicitContact:
         """What the next step depends on: list, skin and the forces of the last rows."""
         arrays = self.search.saved()
         arrays["list_share"] = self.check.share_back.numpy().copy()
+        arrays["starts_bent"] = np.asarray([self.packed])
         for number, (rows, _) in enumerate(self.solves):
             arrays |= {f"rows{number}_{key}": value for key, value in rows.saved().items()}
         return arrays

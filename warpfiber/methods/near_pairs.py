@@ -85,6 +85,10 @@ class NearPairs:
         self._run(1)
         self.found += 1
 
+    def report(self) -> dict[str, float]:
+        """How many there are, and how often they were found."""
+        return {"near_pairs": int(self.count.numpy().sum()), "near_builds": self.found}
+
     def saved(self) -> dict[str, np.ndarray]:
         """Skins, and positions when they were chosen."""
         return {"near_pos": self.pos.numpy().copy(), "near_skin": self.skin.numpy().copy()}

@@ -29,7 +29,7 @@ class PairSearch:
     """Neighbor list and skin; lengths in run units.
 
     `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
-    of one more listed pair, see `skin.PAIR_COST`.
+    of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters.
     """
 
     def __init__(
@@ -43,7 +43,9 @@ class PairSearch:
         workers: int,
         native: bool | None = None,
         pair_cost: float = STEP_PAIR_COST,
+        most_skin: float = MOST_SKIN,
     ) -> None:
+        self.most_skin = most_skin
         self.pair_cost = pair_cost
         self.scene, self.model, self.state = scene, model, state
         self.pair_cost = pair_cost
@@ -87,7 +89,7 @@ class PairSearch:
 
     def _largest_skin(self, start: float) -> float:
         """What a lasting box has room for; a box that is flattened keeps the start skin."""
-        most: float = min(2.0 * MOST_SKIN * self.radius, self._room() * (1.0 - 1e-9))
+        most: float = min(2.0 * self.most_skin * self.radius, self._room() * (1.0 - 1e-9))
         return max(start, most)
 
     def _room(self) -> float:

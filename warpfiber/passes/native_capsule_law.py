@@ -151,9 +151,11 @@ NORMAL = """
         const M acts = is_line & (integral > T(0));
         const V length = la * root(T(0.5) * (T(1) + cosine));
         const V k = modulus * factor0 * sine * length / root(T(2) * reach);
-        V way = -dd / held;
-        way = way > T(-1) ? way : V(T(-1));
-        way = way < T(2) ? way : V(T(2));
+        const V per_part = T(1) / (t1 - t0), beyond = T(0.5) * (T(1) + lb / la);
+        const V ahead = -t0 * per_part, behind = (T(1) - t0) * per_part;
+        const V lowest = smaller(V(T(0)), smaller(ahead, behind)) - beyond;
+        const V highest = larger(V(T(1)), larger(ahead, behind)) + beyond;
+        const V way = smaller(larger(-dd / held, lowest), highest);
         const V3 there = d0 + dv * way;
         force = acts ? k * integral : force;
         stiffness = acts ? k * w1 : stiffness;

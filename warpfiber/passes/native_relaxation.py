@@ -83,7 +83,8 @@ RELAX = """
         return yields && row.soft == T(0) ? e + opening(r, row.force) : e;
     };
     long long relaxed = 0;
-    const long long limit = (long long)most * count;
+    // a few rows that are nearly the same take more, and cost nothing
+    const long long limit = (long long)most * (count > 100 ? count : 100);
     // with more than a part of `low`; whether it had more than that
     auto relax = [&](int r, T part) -> bool {
         Row& row = state[r];

@@ -70,6 +70,8 @@ class Placement:
     """(F,)"""
     report: dict[str, Any] = field(default_factory=dict)
     """orientation tensors, tries, relaxations, seconds; JSON-ready"""
+    starts_bent: bool | None = None
+    """whether the run began with bent fibers; None: as `node_pos` says"""
 
 
 def place_fibers(scene: Scene, rng: np.random.Generator | None = None) -> Placement:
