@@ -174,13 +174,15 @@ def test_drag_over_the_closure(first: int, speed: float) -> None:
     assert np.abs(drag / normal - 0.3).max() < 1e-9
 
 
-def test_ring_on_ring() -> None:
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_ring_on_ring(precision: str) -> None:
     """Two rings face to face: all nodes are pushed alike, the same whichever is numbered first."""
     rods = [hoop(circle([0.0, 0.0, 0.0])), hoop(circle([0.0, 0.0, 2.0 * RADIUS - 2e-5]))]
-    linear, _ = rates(start_rods(rods, contact=RUBBING))
+    linear, _ = rates(start_rods(rods, contact=RUBBING, numerics={"precision": precision}))
+    tolerance = 1e-9 if precision == "float64" else 0.02  # eps of a radius over the overlap
     assert linear[0, 2] < -1.0
-    assert np.abs(linear[:N, 2] / linear[0, 2] - 1.0).max() < 1e-9
-    assert np.abs(linear[N:, 2] / linear[0, 2] + 1.0).max() < 1e-9
+    assert np.abs(linear[:N, 2] / linear[0, 2] - 1.0).max() < tolerance
+    assert np.abs(linear[N:, 2] / linear[0, 2] + 1.0).max() < tolerance
 
 
 def test_pairs() -> None:
