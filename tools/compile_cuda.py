@@ -208,6 +208,7 @@ def _bond_variants() -> list[tuple[str, BondFeatures, tuple[bool, bool]]]:
         ("bed", bed, (False, True)),
         ("pressed bed", replace(bed, press=2), (False, True)),
         ("bed in a container", replace(bed, container=True), (False, True)),
+        ("rings in a container", replace(bed, container=True, closed=True), (False, True)),
         ("gripped bed", replace(bed, press=2, loads=True, grips=True), (False, True)),
         ("start of a bed", bed, (False, False)),
     ]
@@ -250,6 +251,8 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "capsule_pairs", "plain", make_capsule_pairs(precision, CapsuleFeatures())
     rubbing = CapsuleFeatures(periodic=True, dashpot=True, friction=True)
     yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
+    rings = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
+    yield "capsule_pairs", "rings", make_capsule_pairs(precision, rings)
     yield "carry_memory", "", make_carry_memory(precision, True)
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
