@@ -60,7 +60,8 @@ def test_numbering(tilt: float) -> None:
         rods.append(hoop(np.roll(circle(away, tilt), -(2 * shift), axis=0)))
         v = np.zeros((2 * N, 3))
         v[N:, 0], v[N:, 2] = 0.3, -0.2
-        sim = start_rods(rods, v=v, contact=RUBBING, numerics={"dt": 1e-5})
+        told = ["contacts", "overlap", "energy"]
+        sim = start_rods(rods, v=v, contact=RUBBING, numerics={"dt": 1e-5}, quantities=told)
         sim.prepare()
         acts = int(sim.method.contacts.acts.numpy().sum())  # type: ignore[attr-defined]
         sim.step(400)
@@ -68,9 +69,13 @@ def test_numbering(tilt: float) -> None:
         whole = np.concatenate(
             [np.roll(x[:N], shift, axis=0), np.roll(x[N:], 2 * shift, axis=0)],
         )
-        found.append((acts, whole))
+        found.append((acts, whole, sim.measure()))
     assert np.abs(found[0][1][:N] - circle([0.0] * 3)).max() > 1e-6  # the first ring was pushed
-    for acts, whole in found[1:]:
+    for acts, whole, row in found[1:]:
+        largest = max(abs(v) for k, v in row.items() if k.startswith(("energy", "diss")))
+        for name, value in row.items():
+            scale = largest if name.startswith(("energy", "diss")) else 1.0
+            assert abs(value - found[0][2][name]) < 1e-7 * scale, name
         assert acts == found[0][0]
         assert np.abs(whole - found[0][1]).max() < 1e-9 * ROUND
 
