@@ -106,6 +106,7 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *make_end_kernels("float32"),
         *("pair_motion fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
         *("rod_response rod_apply chain_moves chain_response chain_apply".split()),
+        *("lay_on take_off note_load keep_load set_pace".split()),
     }
     names = {kernel for kernel, _, _ in tool.kernels("float32")}
     assert names == {
