@@ -61,7 +61,7 @@ def test_shear_becomes_steady(bed: Path) -> None:
     rows, result = drawn(bed, "shear_quick.toml", "shear")
     level, scatter = result["yield_stress_xz"], result["standard_deviation"]
     strain = rows["grip_strain"]
-    thirds = [rows["stress_xz"][(strain > a) & (strain <= a + 0.75)].mean() for a in (1.5, 2.25)]
+    late = [rows["stress_xz"][(strain > a) & (strain <= a + 0.375)].mean() for a in (0.75, 1.125)]
     assert scatter < 0.3 * level
-    assert abs(thirds[1] - thirds[0]) < 2.0 * scatter
+    assert abs(late[1] - late[0]) < 2.0 * scatter
     assert rows["stress_xz"][strain < 0.1].mean() < 0.5 * level
