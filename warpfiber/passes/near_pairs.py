@@ -21,7 +21,7 @@ from warpfiber.passes.capsule_pairs import CapsuleFeatures
 from warpfiber.passes.native_capsules_source import PARTS
 from warpfiber.passes.native_near_source import near_list_source
 
-# Chosen by trials on a bed of 500 fibers of 26 segments under a plate, on a busy machine: not swept.
+# Chosen by trials on a bed of 500 fibers of 26 segments under a plate; not swept in quiet.
 LEAST = 0.025  # skin of a node at rest, diameters
 LASTING = 20.0  # steps that a skin is made for
 ENOUGH = 5.0  # steps; where the list leaves less, it is built anew
