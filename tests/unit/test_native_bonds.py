@@ -44,7 +44,7 @@ def arrays(sim: Simulation) -> dict[str, Any]:
         "status": state.status,
         "acts": method.contacts.acts,
         "grip": method.grips.node_grip,
-        "contact_load": method.native.contact_load,
+        "contact_touch": method.native.contact_touch,
         "memory": method.contacts.memory,
         "written": method.contacts.written,
     }
@@ -135,7 +135,7 @@ def test_same_as_plain(precision: str, turn: float, name: str) -> None:
     assert expected["acts"].any()
     pairs = native.pair_launch(sim.method.dt)
     found = after(sim, [first, pairs, native.launch(LOADS | END)])
-    assert not found["contact_load"].any()  # ready for the next step
+    assert not found["contact_touch"].any()  # ready for the next step
     assert_near(sim, found, expected, precision)
     assert (name == "grips") == bool(expected["grip"].any())
     if "wall" in str(sim.scene.box) and name != "smooth" and name != "open":

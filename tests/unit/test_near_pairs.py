@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.bonded_crowd import crowd
+from warpfiber.passes.native_capsules_source import TIP_BITS
 from warpfiber.passes.near_pairs import ENOUGH, LASTING, LEAST, part_starts
 from warpfiber.scene import SceneError
 from warpfiber.simulation import Simulation
@@ -68,7 +69,7 @@ def test_near_pairs(steps: int) -> None:
     assert set(found) >= set(np.flatnonzero((apart < reach) & clear))
     assert set(found).isdisjoint(np.flatnonzero((apart > reach) & clear))
     assert (np.diff(found) > 0).all() and len(found) < len(i)
-    nodes = near.i.numpy()[begin[0] : begin[0] + count[0]]
+    nodes = near.i.numpy()[begin[0] : begin[0] + count[0]] >> TIP_BITS
     np.testing.assert_array_equal(nodes, first[i[found[: count[0]]]])
 
 

@@ -13,7 +13,6 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -201,8 +200,10 @@ class BondedSpheres(Method):
             if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
-            first = [pairs(0.0), self._rates()]
+            if self.native is not None:
+                first = [self.native.pair_launch(0.0, keeps=True), self._rates()]
+            else:
+                first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from warpfiber.methods.bonded_launches import REACH_MARGIN, clock_launch
@@ -16,6 +15,8 @@ from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
 from warpfiber.passes.native_capsules_source import LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
+
+CACHE_LINE = 64  # bytes
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -35,19 +36,10 @@ class NativeBonds:
         self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)  # in the step before
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
-        first, last = self._tips()
-        tips = (first + 2 * last).astype(np.uint8)
-        self.segment_tips = wp.array(tips, dtype=wp.uint8, device=device)
-        size = PARTS * model.node_count * LINE
-        self.contact_load = wp.zeros(size, dtype=p.real, device=device)
+        self.contact_load = _aligned(LINE * (1 + PARTS * model.node_count), p.real, device)
+        self.contact_touch = wp.zeros(PARTS * model.node_count, dtype=wp.uint8, device=device)
         assert spheres.contacts is not None
         self.near = NearPairs(spheres, spheres.contacts)
-
-    def _tips(self) -> tuple[np.ndarray, np.ndarray]:
-        """(S,) whether a segment is the first one of its fiber, and the last one."""
-        fiber = self.spheres.model.host["segment_fiber"]
-        other = np.diff(fiber) != 0
-        return np.concatenate([[True], other]), np.concatenate([other, [True]])
 
     def launch(self, phase: int) -> Launch:
         """What `phase` says: sums of LOADS, END and BEGIN."""
@@ -74,6 +66,7 @@ class NativeBonds:
             spheres.holds.load,
             spheres.grips.node_grip,
             self.contact_load,
+            self.contact_touch,
             self.touches,
             self.push,
             self.couple,
@@ -106,9 +99,7 @@ class NativeBonds:
             p.real(spheres.scene.contact.friction),
             p.real(REACH_MARGIN * pairs.reach),
             spheres.groups,
-            self.segment_tips,
             model.fiber_group,
-            model.segment_node,
             model.segment_fiber,
             state.lattice_now,
             pairs.out_start,
@@ -127,6 +118,7 @@ class NativeBonds:
             contacts.memory,
             contacts.written,
             self.contact_load,
+            self.contact_touch,
             state.status,
         ]
         kernel = make_native_capsule_pairs(p.name, contacts.features)
@@ -159,3 +151,11 @@ class NativeBonds:
             middle = [*end, *begin]
         device, status = spheres.model.device, spheres.state.status
         return JoinedSteps(begin, middle, end, device, spheres.workers, status)
+
+
+def _aligned(size: int, kind: Any, device: str) -> Any:
+    """Zeros at the begin of a cache line: a line of loads is then read and written as one."""
+    number = wp.types.type_size_in_bytes(kind)
+    array = wp.zeros(size + CACHE_LINE // number, dtype=kind, device=device)
+    begin = -array.ptr % CACHE_LINE // number
+    return array[begin : begin + size]

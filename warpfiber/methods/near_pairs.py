@@ -11,7 +11,7 @@ import warp as wp
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import REACH_MARGIN
 from warpfiber.passes.executor import Executor, Launch
-from warpfiber.passes.native_capsules_source import PARTS
+from warpfiber.passes.native_capsules_source import LANES, PARTS
 from warpfiber.passes.near_pairs import LEAST, make_near_pairs, part_starts
 
 if TYPE_CHECKING:
@@ -31,19 +31,24 @@ class NearPairs:
         self.count = wp.zeros(PARTS, dtype=wp.int32, device=device)
         starts = part_starts(model.segment_count)
         self.part_start = wp.array(starts, dtype=wp.int32, device=device)
+        begins = np.concatenate([[True], np.diff(model.host["segment_fiber"]) != 0])
+        tips = begins + 2 * np.roll(begins, -1)  # whether first, whether last of its fiber
+        self.tips = wp.array(tips.astype(np.uint8), dtype=wp.uint8, device=device)
         self.found = 0  # times
         self._executors: list[Executor] = []
         self._allocate()
 
     def _allocate(self) -> None:
-        size, device = self.contacts.search.list.pair_capacity, self.spheres.model.device
+        device = self.spheres.model.device
+        size = self.contacts.search.list.pair_capacity + 2 * LANES  # sweeps read ahead
         self.pair = wp.zeros(size, dtype=wp.int32, device=device)
         self.i = wp.zeros(size, dtype=wp.int32, device=device)
         self.j = wp.zeros(size, dtype=wp.int32, device=device)
+        self.image = wp.zeros(size, dtype=wp.int32, device=device)
 
     def arrays(self) -> list[Any]:
         """What the pair sweep takes."""
-        return [self.part_start, self.count, self.pair, self.i, self.j]
+        return [self.part_start, self.count, self.pair, self.i, self.j, self.image]
 
     def launches(self) -> list[Launch]:
         """Skins of the nodes, and the pairs that they make near."""
@@ -54,9 +59,11 @@ class NearPairs:
         inputs = [p.real(spheres.dt), p.real(least), pairs.skin_out, state.list_pos]
         inputs += [spheres.place, state.node_velocity, self.pos, self.skin, self.short]
         chosen = Launch("skins", skins, model.node_count, inputs, split=True)
-        inputs = [p.real(REACH_MARGIN * pairs.reach), model.segment_node, state.lattice_now]
+        inputs = [p.real(REACH_MARGIN * pairs.reach), model.segment_node, self.tips]
+        inputs += [state.lattice_now]
         inputs += [pairs.out_start, self.part_start, pairs.pair_i, pairs.pair_j, pairs.pair_image]
-        inputs += [self.pos, self.skin, self.pair, self.i, self.j, self.count]
+        inputs += [self.pos, self.skin, self.pair, self.i, self.j, self.image]
+        inputs += [self.count]
         return [chosen, Launch("near pairs", near, PARTS, inputs, split=True)]
 
     def _run(self, which: int) -> None:
@@ -79,7 +86,7 @@ class NearPairs:
 
     def find(self) -> None:
         """Near pairs of the skins that were chosen; the list may be a new one."""
-        if self.pair.shape[0] != self.contacts.search.list.pair_capacity:
+        if self.pair.shape[0] != self.contacts.search.list.pair_capacity + 2 * LANES:
             self.close()
             self._allocate()
         self._run(1)

@@ -30,8 +30,9 @@ FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
     near_skin stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
-    node_grip contact_load node_touches node_push node_couple near_pos place node_pos node_velocity
-    node_turn node_spin node_rate node_spin_rate still_steps status block_fiber block_own
+    node_grip contact_load contact_touch node_touches node_push node_couple near_pos place node_pos
+    node_velocity node_turn node_spin node_rate node_spin_rate still_steps status block_fiber
+    block_own
 """.split()
 
 
@@ -77,6 +78,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
@@ -132,6 +134,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
@@ -209,6 +212,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             node_load,
             node_grip,
             contact_load,
+            contact_touch,
             node_touches,
             node_push,
             node_couple,

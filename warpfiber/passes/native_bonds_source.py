@@ -14,7 +14,7 @@ from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-from warpfiber.passes.native_capsules_source import LINE, PARTS
+from warpfiber.passes.native_capsules_source import PARTS
 
 LANES = 8  # fibers, in both precisions
 LOADS, END, BEGIN = 1, 2, 4
@@ -49,7 +49,6 @@ def _constants(features: BondFeatures) -> str:
         "IS_FREE": FREE,
         "IS_CLAMPED": CLAMPED,
         "IS_LOWER": LOWER,
-        "LINE": LINE,
         "PARTS": PARTS,
         "LOADS": LOADS,
         "END": END,
@@ -59,20 +58,20 @@ def _constants(features: BondFeatures) -> str:
     return "\n".join(lines)
 
 
-# Loads of contacts: the parts of the pair sweep in turn, cleared for the next one.
+# Loads of contacts: the parts of the pair sweep in turn; a node without any has the first line, of
+# zeros.
 _GATHER = """
-    const long part = (long)LINE * node_count;
     for (int k = 0; k < nodes; ++k) {
         V r[W];
         #pragma unroll
         for (int l = 0; l < W; ++l) {
-            const T* from = contact_load + (long)LINE * (first[l] + k);
-            r[l] = *(const U*)from;
-            for (int p = 1; p < PARTS; ++p) r[l] += *(const U*)(from + p * part);
+            const long node = first[l] + k;
+            r[l] = load_lines[(1 + node) * contact_touch[node]];
+            for (int p = 1; p < PARTS; ++p) {
+                const long line = 1 + node + (long)node_count * p;
+                r[l] += load_lines[line * contact_touch[line - 1]];
+            }
         }
-        for (int l = 0; l < own; ++l)
-            for (int p = 0; p < PARTS; ++p)
-                *(U*)(contact_load + (long)LINE * (first[l] + k) + p * part) = V(T(0));
         TRANSPOSE
         #pragma unroll
         for (int c = 0; c < 3; ++c) {
@@ -80,6 +79,9 @@ _GATHER = """
             b[3 * k + c] = r[3 + c];
         }
     }
+    for (int l = 0; l < own; ++l)
+        for (int p = 0; p < PARTS; ++p)
+            __builtin_memset(contact_touch + first[l] + (long)node_count * p, 0, nodes);
 """
 
 _RATES = """
@@ -227,6 +229,7 @@ _SWEEP = """
     const int segments = g.segments, nodes = segments + 1;
     int first[W];
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
+    const V* const load_lines = (const V*)contact_load;
     const bool loads = phase & LOADS, ends = phase & END, begins = phase & BEGIN;
 
     P* x = (P*)__builtin_alloca_with_align(6 * nodes * sizeof(P), 512);
