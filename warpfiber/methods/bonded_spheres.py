@@ -37,7 +37,7 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
-from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.native_bonds_source import FROM_NODES, LOADS
 from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -217,7 +217,7 @@ class BondedSpheres(Method):
     def _rates(self) -> Launch:
         """Accelerations of the start."""
         if self.native is not None:
-            return self.native.launch(LOADS)
+            return self.native.launch(LOADS | FROM_NODES)
         return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
@@ -339,6 +339,7 @@ class BondedSpheres(Method):
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
             if self.native is not None:
+                self.native.take_shapes()
                 self.native.near.restore(arrays)
             self._stop_executor()
 

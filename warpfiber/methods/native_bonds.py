@@ -11,12 +11,18 @@ from warpfiber.methods.near_pairs import NearPairs
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
-from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
+from warpfiber.passes.native_bonds_source import (
+    BEGIN,
+    END,
+    FROM_NODES,
+    LANES,
+    LOADS,
+    TO_NODES,
+)
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
 from warpfiber.passes.native_capsules_source import LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
-
-CACHE_LINE = 64  # bytes
+from warpfiber.passes.node_blocks import NodeBlocks, aligned_zeros
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -32,17 +38,31 @@ class NativeBonds:
         fibers, own = fiber_blocks(model.host["fiber_group"], LANES)
         self.block_fiber = wp.array(fibers.ravel(), dtype=wp.int32, device=device)
         self.block_own = wp.array(own, dtype=wp.int32, device=device)
+        self.blocks = blocks = NodeBlocks.of(fibers, own, model.host["fiber_node_start"])
+        self.block_start = wp.array(blocks.start, dtype=wp.int32, device=device)
+        self.block_axis = blocks.zeros(3, p.real, device)
+        self.block_length = blocks.zeros(1, p.real, device)
+        self.block_turn = blocks.zeros(4, p.real, device)
+        self.take_shapes()
         nodes = model.node_count if any(features.walls) else 0
         self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)  # in the step before
+        walled = model.fiber_count if any(features.walls) else 0
+        self.fiber_touches = wp.zeros(walled, dtype=wp.uint8, device=device)
+        self.fiber_extent = wp.zeros(6 * walled, dtype=wp.float64, device=device)
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
-        self.contact_load = _aligned(LINE * (1 + PARTS * model.node_count), p.real, device)
+        self.contact_load = aligned_zeros(LINE * (1 + PARTS * model.node_count), p.real, device)
         self.contact_touch = wp.zeros(PARTS * model.node_count, dtype=wp.uint8, device=device)
         assert spheres.contacts is not None
-        self.near = NearPairs(spheres, spheres.contacts)
+        self.near = NearPairs(spheres, spheres.contacts, blocks)
+
+    def take_shapes(self) -> None:
+        """Bring the stress-free shapes into the blocks."""
+        for name, array in (("bond_axis", self.block_axis), ("bond_length", self.block_length)):
+            self.blocks.fill(array, getattr(self.spheres, name).numpy())
 
     def launch(self, phase: int) -> Launch:
-        """What `phase` says: sums of LOADS, END and BEGIN."""
+        """What `phase` says: sums of LOADS, END, BEGIN, FROM_NODES and TO_NODES."""
         spheres = self.spheres
         model, state, p = spheres.model, spheres.state, spheres.model.precision
         inputs = [
@@ -55,22 +75,20 @@ class NativeBonds:
             p.real(spheres.scene.contact.wall_friction),
             spheres.wall_memory,
             spheres.wall_depth,
-            self.near.skin,
             spheres.stage,
             spheres.groups,
             model.fiber_node_start,
             model.fiber_group,
-            spheres.bond_axis,
-            spheres.bond_length,
             spheres.holds.hold,
             spheres.holds.load,
             spheres.grips.node_grip,
             self.contact_load,
             self.contact_touch,
+            self.fiber_extent,
+            self.fiber_touches,
             self.touches,
             self.push,
             self.couple,
-            self.near.pos,
             spheres.place,
             state.node_pos,
             state.node_velocity,
@@ -82,6 +100,12 @@ class NativeBonds:
             state.status,
             self.block_fiber,
             self.block_own,
+            self.block_start,
+            self.block_axis,
+            self.block_length,
+            self.near.block_pos,
+            self.near.block_skin,
+            self.block_turn,
         ]
         kernel = make_native_bond_sweep(p.name, spheres.features)
         return Launch("bonds", kernel, self.block_own.shape[0], inputs, split=True)
@@ -141,21 +165,14 @@ class NativeBonds:
         clock, dt = clock_launch(spheres), spheres.dt
         motion = spheres.press.motion()
         meter = [*spheres.press.meter(), *spheres.grips.meter(), *spheres.energies.losses()]
-        drift = self.launch(BEGIN)
+        drift = self.launch(BEGIN | FROM_NODES)
         drift.name = "drift"
-        self.touches.fill_(1)  # walls may have memories of a saved run
+        for touches in (self.touches, self.fiber_touches):
+            touches.fill_(1)  # walls may have memories of a saved run
         begin = [clock, *motion, drift]
         middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
-        end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END), *meter]
+        end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END | TO_NODES), *meter]
         if spheres.energies.told:
             middle = [*end, *begin]
         device, status = spheres.model.device, spheres.state.status
         return JoinedSteps(begin, middle, end, device, spheres.workers, status)
-
-
-def _aligned(size: int, kind: Any, device: str) -> Any:
-    """Zeros at the begin of a cache line: a line of loads is then read and written as one."""
-    number = wp.types.type_size_in_bytes(kind)
-    array = wp.zeros(size + CACHE_LINE // number, dtype=kind, device=device)
-    begin = -array.ptr % CACHE_LINE // number
-    return array[begin : begin + size]

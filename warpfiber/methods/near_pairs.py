@@ -13,6 +13,7 @@ from warpfiber.methods.bonded_launches import REACH_MARGIN
 from warpfiber.passes.executor import Executor, Launch
 from warpfiber.passes.native_capsules_source import LANES, PARTS
 from warpfiber.passes.near_pairs import LEAST, make_near_pairs, part_starts
+from warpfiber.passes.node_blocks import NodeBlocks
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -21,12 +22,17 @@ if TYPE_CHECKING:
 class NearPairs:
     """Skins of nodes and the near pairs that go with them."""
 
-    def __init__(self, spheres: BondedSpheres, contacts: BondedContacts) -> None:
-        self.spheres, self.contacts = spheres, contacts
+    def __init__(
+        self, spheres: BondedSpheres, contacts: BondedContacts, blocks: NodeBlocks
+    ) -> None:
+        self.spheres, self.contacts, self.blocks = spheres, contacts, blocks
         model = spheres.model
         p, device, nodes = model.precision, model.device, model.node_count
         self.pos = wp.zeros(nodes, dtype=wp.vec3d, device=device)
         self.skin = wp.zeros(nodes, dtype=p.real, device=device)
+        self.slot = wp.array(blocks.slot, dtype=wp.int32, device=device)
+        self.block_pos = blocks.zeros(3, wp.float64, device)
+        self.block_skin = blocks.zeros(1, p.real, device)
         self.short = wp.zeros(2, dtype=wp.int32, device=device)
         self.count = wp.zeros(PARTS, dtype=wp.int32, device=device)
         starts = part_starts(model.segment_count)
@@ -57,7 +63,8 @@ class NearPairs:
         skins, near = make_near_pairs(p.name, self.contacts.features)
         least = LEAST * 2.0 * self.contacts.search.radius
         inputs = [p.real(spheres.dt), p.real(least), pairs.skin_out, state.list_pos]
-        inputs += [spheres.place, state.node_velocity, self.pos, self.skin, self.short]
+        inputs += [spheres.place, state.node_velocity, self.pos, self.skin]
+        inputs += [self.slot, self.block_pos, self.block_skin, self.short]
         chosen = Launch("skins", skins, model.node_count, inputs, split=True)
         inputs = [p.real(REACH_MARGIN * pairs.reach), model.segment_node, self.tips]
         inputs += [state.lattice_now]
@@ -108,6 +115,8 @@ class NearPairs:
         else:
             self.pos.assign(arrays["near_pos"])
             self.skin.assign(arrays["near_skin"])
+            self.blocks.fill(self.block_pos, arrays["near_pos"])
+            self.blocks.fill(self.block_skin, arrays["near_skin"])
         self.find()
 
     def close(self) -> None:

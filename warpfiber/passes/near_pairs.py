@@ -18,6 +18,7 @@ import warp as wp
 
 from warpfiber.model import precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.native_bonds_source import LANES
 from warpfiber.passes.native_capsules_source import PARTS
 from warpfiber.passes.native_near_source import near_list_source
 
@@ -59,6 +60,9 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
         node_velocity: wp.array(dtype=vec3),
         near_pos_out: wp.array(dtype=wp.vec3d),
         near_skin_out: wp.array(dtype=real),
+        node_slot: wp.array(dtype=wp.int32),
+        block_pos_out: wp.array(dtype=wp.float64),
+        block_skin_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
     ):
         i = wp.tid() + offset
@@ -72,6 +76,11 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
             short_out[1] = 1
         near_pos_out[i] = x
         near_skin_out[i] = wp.max(skin, real(0.0))
+        slot = node_slot[i]
+        first = 3 * slot - 2 * (slot % wp.static(LANES))
+        for axis in range(3):
+            block_pos_out[first + wp.static(LANES) * axis] = x[axis]
+        block_skin_out[slot] = near_skin_out[i]
 
     @wp.func_native(near_list_source(name, features, ARRAYS))
     def find_near(
