@@ -106,6 +106,13 @@ SCENES: dict[str, dict[str, Any]] = {
         ]
     },
     "smooth": {"contact": {"friction": 0.0, "wall_friction": 0.0, "damping": 0.0}},
+    "planes": {
+        "wall": [
+            {"name": "z-", "velocity": [0.1, -0.05, 0.0]},
+            {"name": "y+", "friction": 0.9},
+            {"name": "z+", "friction": 0.0},
+        ]
+    },
     "open": {
         "box": {"size": [0.06, 0.04, 0.02], "boundary": ["open"] * 3},
         "contact": {"friction": 0.5, "damping": 0.113},
