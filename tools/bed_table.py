@@ -37,11 +37,17 @@ def branches(folder: Path) -> list[Rows]:
 
 
 def at(rows: Rows, name: str, fraction: float) -> float:
-    """A column where phi is this, by a line through the rows near it; nan without two of them."""
+    """A column where phi is this, by a line through the rows near it, or the rows next to it.
+
+    nan if the branch does not reach it.
+    """
     away = rows["volume_fraction"] - fraction
-    near = np.abs(away) < 0.5 * WINDOW
-    if len(np.unique(away[near])) < 2:
+    if not len(away) or away.min() > 0.0 or away.max() < 0.0:
         return np.nan
+    near = np.abs(away) < 0.5 * WINDOW
+    if len(np.unique(away[near])) < 3:
+        order = np.argsort(away)
+        return float(np.interp(0.0, away[order], rows[name][order]))
     return float(np.polyfit(away[near], rows[name][near], 1)[1])
 
 

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from tests.bonded_crowd import crowd
-from tests.physics.test_contact_hand_over import (
-    dragged,
-)
+from tests.physics.test_contact_hand_over import STEP, dragged
 from tests.physics.test_contact_hand_over import test_lines_over_nodes as lines_over_nodes
 from tests.physics.test_contact_hand_over import test_sliding_over_nodes as sliding_over_nodes
 from tests.physics.test_contact_hand_over import test_sticking_over_a_node as sticking_over_a_node
@@ -257,7 +255,7 @@ def test_hand_over(monkeypatch: pytest.MonkeyPatch, velocity: list[float]) -> No
     """A contact that passes nodes, stuck and sliding, at a right angle and along a line."""
     monkeypatch.setattr(native_bonds, "FIBERS_PER_BLOCK", 0)
     assert dragged(90.0, 0.3, velocity, 0.2).method.native is not None  # type: ignore[attr-defined]
-    sliding_over_nodes(velocity)
+    sliding_over_nodes(velocity, STEP)
     sticking_over_a_node(0.98, velocity)
     lines_over_nodes(8.0)
 
