@@ -13,7 +13,6 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
-from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.native_bonds_source import FROM_NODES, LOADS
 from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -201,8 +200,10 @@ class BondedSpheres(Method):
             if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
-            first = [pairs(0.0), self._rates()]
+            if self.native is not None:
+                first = [self.native.pair_launch(0.0, keeps=True), self._rates()]
+            else:
+                first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
@@ -216,7 +217,7 @@ class BondedSpheres(Method):
     def _rates(self) -> Launch:
         """Accelerations of the start."""
         if self.native is not None:
-            return self.native.launch(LOADS)
+            return self.native.launch(LOADS | FROM_NODES)
         return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
@@ -338,6 +339,7 @@ class BondedSpheres(Method):
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
             if self.native is not None:
+                self.native.take_shapes()
                 self.native.near.restore(arrays)
             self._stop_executor()
 
