@@ -61,6 +61,7 @@ from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.prune_kernels import make_plain_prune, make_wide_kernels
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
 from warpfiber.passes.row_count import RowFeatures, make_row_count
@@ -300,7 +301,8 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
             yield name, variant, kernel
         yield "fill_rows", variant, make_row_fill(precision, features)
     yield "pair_motion", "", make_pair_motion(precision, True)
-    for name, kernel in make_list_bound(precision).items():
+    prune = make_wide_kernels(precision) | make_plain_prune(precision, True)
+    for name, kernel in (make_list_bound(precision) | prune).items():
         yield name, "", kernel
     for variant, fibers in {
         "orientation": MeasureFeatures(),

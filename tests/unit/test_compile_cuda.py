@@ -107,6 +107,8 @@ def test_every_pass_is_compiled_in_both_precisions() -> None:
         *("pair_motion fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
         *("rod_response rod_apply chain_moves chain_response chain_apply".split()),
         *("lay_on take_off note_load keep_load set_pace".split()),
+        *("remember_wide begin_test test_wide begin_prune remember_nodes".split()),
+        *("mark_near keep_near".split()),
     }
     names = {kernel for kernel, _, _ in tool.kernels("float32")}
     assert names == {
