@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from tests.bonded_crowd import crowd
-from tests.physics.test_contact_hand_over import (
-    dragged,
-)
+from tests.physics.test_contact_hand_over import STEP, dragged
 from tests.physics.test_contact_hand_over import test_lines_over_nodes as lines_over_nodes
 from tests.physics.test_contact_hand_over import test_sliding_over_nodes as sliding_over_nodes
 from tests.physics.test_contact_hand_over import test_sticking_over_a_node as sticking_over_a_node
@@ -23,7 +21,7 @@ from warpfiber.methods.bonded_launches import bond_launch, drift_launch, pair_la
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes import native_bonds
 from warpfiber.passes.executor import Launch, load_kernels
-from warpfiber.passes.native_bonds_source import BEGIN, END, LOADS
+from warpfiber.passes.native_bonds_source import BEGIN, END, FROM_NODES, LOADS, TO_NODES
 from warpfiber.simulation import Simulation
 
 BOUND = {"float64": 1e-13, "float32": 256 * np.finfo(np.float32).eps}
@@ -44,7 +42,7 @@ def arrays(sim: Simulation) -> dict[str, Any]:
         "status": state.status,
         "acts": method.contacts.acts,
         "grip": method.grips.node_grip,
-        "contact_load": method.native.contact_load,
+        "contact_touch": method.native.contact_touch,
         "memory": method.contacts.memory,
         "written": method.contacts.written,
     }
@@ -85,6 +83,7 @@ def assert_near(sim: Simulation, found: Any, expected: Any, precision: str) -> N
         np.testing.assert_array_equal(found[name], expected[name])
 
 
+ALONE = FROM_NODES | TO_NODES
 LOAD = [
     {"fiber": 3, "node": 0, "hold": "clamp", "velocity": [0.01, 0.0, 0.0]},
     {"fiber": 9, "node": 3, "hold": "position"},
@@ -105,6 +104,13 @@ SCENES: dict[str, dict[str, Any]] = {
         ]
     },
     "smooth": {"contact": {"friction": 0.0, "wall_friction": 0.0, "damping": 0.0}},
+    "planes": {
+        "wall": [
+            {"name": "z-", "velocity": [0.1, -0.05, 0.0]},
+            {"name": "y+", "friction": 0.9},
+            {"name": "z+", "friction": 0.0},
+        ]
+    },
     "open": {
         "box": {"size": [0.06, 0.04, 0.02], "boundary": ["open"] * 3},
         "contact": {"friction": 0.5, "damping": 0.113},
@@ -122,7 +128,7 @@ def test_same_as_plain(precision: str, turn: float, name: str) -> None:
     native = sim.method.native  # type: ignore[attr-defined]
     assert native is not None
     pairs = pair_launch(sim.method, sim.method.dt)  # type: ignore[arg-type]
-    begun = [drift_launch(sim.method), native.launch(BEGIN)]  # type: ignore[arg-type]
+    begun = [drift_launch(sim.method), native.launch(BEGIN | ALONE)]  # type: ignore[arg-type]
     plain, simd = (after(sim, [launch]) for launch in begun)
     for kept in ("node_rate", "node_spin_rate"):
         np.testing.assert_array_equal(simd[kept], plain[kept])
@@ -134,8 +140,8 @@ def test_same_as_plain(precision: str, turn: float, name: str) -> None:
     expected = after(sim, [first, pairs, ends])
     assert expected["acts"].any()
     pairs = native.pair_launch(sim.method.dt)
-    found = after(sim, [first, pairs, native.launch(LOADS | END)])
-    assert not found["contact_load"].any()  # ready for the next step
+    found = after(sim, [first, pairs, native.launch(LOADS | END | ALONE)])
+    assert not found["contact_touch"].any()  # ready for the next step
     assert_near(sim, found, expected, precision)
     assert (name == "grips") == bool(expected["grip"].any())
     if "wall" in str(sim.scene.box) and name != "smooth" and name != "open":
@@ -148,7 +154,7 @@ def check_pairs(sim: Simulation, precision: str) -> None:
     """What every pair does, stored by pair, after the begin of a step."""
     method: Any = sim.method
     contacts, native = method.contacts, method.native
-    for launch in (native.launch(BEGIN), pair_launch(method, method.dt)):
+    for launch in (native.launch(BEGIN | ALONE), pair_launch(method, method.dt)):
         launch.run("cpu")
     expected = pair_arrays(method)
     native.pair_launch(method.dt, keeps=True).run("cpu")
@@ -177,9 +183,13 @@ def test_joined(precision: str) -> None:
     sim.prepare()
     native = sim.method.native  # type: ignore[attr-defined]
     pairs = native.pair_launch(sim.method.dt)
-    begin, end = native.launch(BEGIN), native.launch(LOADS | END)
+    begin, end = native.launch(BEGIN | ALONE), native.launch(LOADS | END | ALONE)
     apart = after(sim, [begin, pairs, end, begin])
-    joined = after(sim, [begin, pairs, native.launch(LOADS | END | BEGIN)])
+    assert apart["wall_depth"].any()
+    for touches in (native.touches, native.fiber_touches):
+        touches.zero_()  # only where fibers are says that these are at a wall
+    parts = [native.launch(BEGIN | FROM_NODES), native.launch(LOADS | END | BEGIN | TO_NODES)]
+    joined = after(sim, [parts[0], pairs, parts[1]])
     for name in apart:
         if name not in ("node_rate", "node_spin_rate"):
             np.testing.assert_array_equal(joined[name], apart[name], name)
@@ -245,7 +255,7 @@ def test_hand_over(monkeypatch: pytest.MonkeyPatch, velocity: list[float]) -> No
     """A contact that passes nodes, stuck and sliding, at a right angle and along a line."""
     monkeypatch.setattr(native_bonds, "FIBERS_PER_BLOCK", 0)
     assert dragged(90.0, 0.3, velocity, 0.2).method.native is not None  # type: ignore[attr-defined]
-    sliding_over_nodes(velocity)
+    sliding_over_nodes(velocity, STEP)
     sticking_over_a_node(0.98, velocity)
     lines_over_nodes(8.0)
 
@@ -259,7 +269,7 @@ def test_torn(bad: float, fiber: int) -> None:
     place = sim.method.place.numpy()  # type: ignore[attr-defined]
     place[sim.fiber_node_start[fiber] + 1, 1] += bad
     native = sim.method.native  # type: ignore[attr-defined]
-    found = after(sim, [native.launch(LOADS | END)])
+    found = after(sim, [native.launch(LOADS | END | ALONE)])
     assert found["status"][TORN] == 1 and found["status"][BAD_FIBER] == fiber
     others = np.delete(np.arange(len(place)), np.arange(*sim.fiber_node_start[fiber : fiber + 2]))
     assert np.isfinite(found["node_velocity"][others]).all()
@@ -270,11 +280,11 @@ def test_flags() -> None:
     sim = crowd()
     sim.prepare()
     native = sim.method.native  # type: ignore[attr-defined]
-    native.near.skin.fill_(10.0)
+    native.near.block_skin.fill_(10.0)
     assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 0
-    skin = native.near.skin.numpy()
-    skin[-1] = 0.0
-    native.near.skin.assign(skin)
+    skin = native.near.block_skin.numpy()
+    skin[native.blocks.slot[-1]] = 0.0
+    native.near.block_skin.assign(skin)
     assert after(sim, [native.launch(BEGIN)])["status"][EXPIRED] == 1
     words = sim.state.status.numpy().copy()
     words[HALT] = 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.bonded_crowd import crowd
+from warpfiber.passes.native_capsules_source import TIP_BITS
 from warpfiber.passes.near_pairs import ENOUGH, LASTING, LEAST, part_starts
 from warpfiber.scene import SceneError
 from warpfiber.simulation import Simulation
@@ -48,6 +49,12 @@ def test_near_pairs(steps: int) -> None:
     near.find()
     skin, x = near.skin.numpy(), method.place.numpy()
     np.testing.assert_array_equal(near.pos.numpy(), x)
+    np.testing.assert_array_equal(near.block_skin.numpy()[near.blocks.slot], skin)
+    in_blocks = near.block_pos.numpy().reshape(len(near.blocks.nodes), 3, -1)
+    own = np.zeros(near.blocks.nodes.size, dtype=bool)
+    own[near.blocks.slot] = True
+    own = own.reshape(near.blocks.nodes.shape)
+    np.testing.assert_array_equal(in_blocks.transpose(0, 2, 1)[own], x[near.blocks.nodes[own]])
     pace = method.dt * np.linalg.norm(sim.state.node_velocity.numpy(), axis=1)
     room = 0.5 * pairs.skin - np.linalg.norm(x - sim.state.list_pos.numpy(), axis=1)
     least = LEAST * 2.0 * method.contacts.search.radius
@@ -68,7 +75,7 @@ def test_near_pairs(steps: int) -> None:
     assert set(found) >= set(np.flatnonzero((apart < reach) & clear))
     assert set(found).isdisjoint(np.flatnonzero((apart > reach) & clear))
     assert (np.diff(found) > 0).all() and len(found) < len(i)
-    nodes = near.i.numpy()[begin[0] : begin[0] + count[0]]
+    nodes = near.i.numpy()[begin[0] : begin[0] + count[0]] >> TIP_BITS
     np.testing.assert_array_equal(nodes, first[i[found[: count[0]]]])
 
 

@@ -13,7 +13,6 @@ Limits: walls are planes of the box; dt below `stability.step_limits`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,13 +37,14 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.bonds import END_SPEED, SETTLING, STAGE_SIZE, BondFeatures
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, load_kernels
 from warpfiber.passes.native_bonds import native_bonds_apply
-from warpfiber.passes.native_bonds_source import LOADS
+from warpfiber.passes.native_bonds_source import FROM_NODES, LOADS
 from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.containers import container
 from warpfiber.scene.gripping import GRIPPING
+from warpfiber.scene.planes import rubs, wall_faces
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 
@@ -74,8 +74,7 @@ class BondedSpheres(Method):
             loads=self.holds.used,
             closed=any(is_closed(group) for group in scene.fibers),
             pairs=scene.contact.law != "none" and model.segment_count > 1,
-            wall_friction=scene.contact.wall_friction > 0.0
-            and (any(model.domain.wall) or container(scene) is not None),
+            wall_friction=rubs(scene),
             container=container(scene) is not None,
             press=self.press.axis,
             grips=self.grips.used,
@@ -95,6 +94,8 @@ class BondedSpheres(Method):
         self.node_spin_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
         kept = SIDES * nodes if self.features.wall_friction else 0
+        faces = np.asarray(wall_faces(scene)) / [1.0, *[model.units.velocity] * 3]
+        self.wall_face = wp.array(faces.astype(p.numpy), dtype=p.vec4, device=device)
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)
         self.wall_depth = wp.zeros(kept, dtype=p.real, device=device)
         self.stage = wp.zeros(STAGE_SIZE, dtype=p.real, device=device)
@@ -201,8 +202,10 @@ class BondedSpheres(Method):
             if replaced:
                 self._stop_executor()
                 self._prepare_steps([])  # a list that grew has other arrays
-            pairs = self.native.pair_launch if self.native else partial(pair_launch, self)
-            first = [pairs(0.0), self._rates()]
+            if self.native is not None:
+                first = [self.native.pair_launch(0.0, keeps=True), self._rates()]
+            else:
+                first = [pair_launch(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()
@@ -216,7 +219,7 @@ class BondedSpheres(Method):
     def _rates(self) -> Launch:
         """Accelerations of the start."""
         if self.native is not None:
-            return self.native.launch(LOADS)
+            return self.native.launch(LOADS | FROM_NODES)
         return bond_launch(self, drifts=False, kicks=False)
 
     def _settle(self) -> bool:
@@ -338,6 +341,7 @@ class BondedSpheres(Method):
         if self.contacts is not None:
             self.contacts.restore(arrays, self.step_count)
             if self.native is not None:
+                self.native.take_shapes()
                 self.native.near.restore(arrays)
             self._stop_executor()
 

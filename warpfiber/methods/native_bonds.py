@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from warpfiber.methods.bonded_launches import REACH_MARGIN, clock_launch
@@ -12,10 +11,18 @@ from warpfiber.methods.near_pairs import NearPairs
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.joined_steps import JoinedSteps
 from warpfiber.passes.native_bonds import make_native_bond_sweep
-from warpfiber.passes.native_bonds_source import BEGIN, END, LANES, LOADS
+from warpfiber.passes.native_bonds_source import (
+    BEGIN,
+    END,
+    FROM_NODES,
+    LANES,
+    LOADS,
+    TO_NODES,
+)
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
 from warpfiber.passes.native_capsules_source import LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
+from warpfiber.passes.node_blocks import NodeBlocks, aligned_zeros
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -31,26 +38,31 @@ class NativeBonds:
         fibers, own = fiber_blocks(model.host["fiber_group"], LANES)
         self.block_fiber = wp.array(fibers.ravel(), dtype=wp.int32, device=device)
         self.block_own = wp.array(own, dtype=wp.int32, device=device)
+        self.blocks = blocks = NodeBlocks.of(fibers, own, model.host["fiber_node_start"])
+        self.block_start = wp.array(blocks.start, dtype=wp.int32, device=device)
+        self.block_axis = blocks.zeros(3, p.real, device)
+        self.block_length = blocks.zeros(1, p.real, device)
+        self.block_turn = blocks.zeros(4, p.real, device)
+        self.take_shapes()
         nodes = model.node_count if any(features.walls) else 0
         self.touches = wp.zeros(nodes, dtype=wp.uint8, device=device)  # in the step before
+        walled = model.fiber_count if any(features.walls) else 0
+        self.fiber_touches = wp.zeros(walled, dtype=wp.uint8, device=device)
+        self.fiber_extent = wp.zeros(6 * walled, dtype=wp.float64, device=device)
         self.push = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.couple = wp.zeros(nodes, dtype=p.vec3, device=device)
-        first, last = self._tips()
-        tips = (first + 2 * last).astype(np.uint8)
-        self.segment_tips = wp.array(tips, dtype=wp.uint8, device=device)
-        size = PARTS * model.node_count * LINE
-        self.contact_load = wp.zeros(size, dtype=p.real, device=device)
+        self.contact_load = aligned_zeros(LINE * (1 + PARTS * model.node_count), p.real, device)
+        self.contact_touch = wp.zeros(PARTS * model.node_count, dtype=wp.uint8, device=device)
         assert spheres.contacts is not None
-        self.near = NearPairs(spheres, spheres.contacts)
+        self.near = NearPairs(spheres, spheres.contacts, blocks)
 
-    def _tips(self) -> tuple[np.ndarray, np.ndarray]:
-        """(S,) whether a segment is the first one of its fiber, and the last one."""
-        fiber = self.spheres.model.host["segment_fiber"]
-        other = np.diff(fiber) != 0
-        return np.concatenate([[True], other]), np.concatenate([other, [True]])
+    def take_shapes(self) -> None:
+        """Bring the stress-free shapes into the blocks."""
+        for name, array in (("bond_axis", self.block_axis), ("bond_length", self.block_length)):
+            self.blocks.fill(array, getattr(self.spheres, name).numpy())
 
     def launch(self, phase: int) -> Launch:
-        """What `phase` says: sums of LOADS, END and BEGIN."""
+        """What `phase` says: sums of LOADS, END, BEGIN, FROM_NODES and TO_NODES."""
         spheres = self.spheres
         model, state, p = spheres.model, spheres.state, spheres.model.precision
         inputs = [
@@ -60,24 +72,23 @@ class NativeBonds:
             spheres.press.velocity,
             spheres.press.fiber_push,
             p.real(spheres.scene.contact.damping),
-            p.real(spheres.scene.contact.wall_friction),
+            spheres.wall_face,
             spheres.wall_memory,
             spheres.wall_depth,
-            self.near.skin,
             spheres.stage,
             spheres.groups,
             model.fiber_node_start,
             model.fiber_group,
-            spheres.bond_axis,
-            spheres.bond_length,
             spheres.holds.hold,
             spheres.holds.load,
             spheres.grips.node_grip,
             self.contact_load,
+            self.contact_touch,
+            self.fiber_extent,
+            self.fiber_touches,
             self.touches,
             self.push,
             self.couple,
-            self.near.pos,
             spheres.place,
             state.node_pos,
             state.node_velocity,
@@ -89,6 +100,12 @@ class NativeBonds:
             state.status,
             self.block_fiber,
             self.block_own,
+            self.block_start,
+            self.block_axis,
+            self.block_length,
+            self.near.block_pos,
+            self.near.block_skin,
+            self.block_turn,
         ]
         kernel = make_native_bond_sweep(p.name, spheres.features)
         return Launch("bonds", kernel, self.block_own.shape[0], inputs, split=True)
@@ -106,9 +123,7 @@ class NativeBonds:
             p.real(spheres.scene.contact.friction),
             p.real(REACH_MARGIN * pairs.reach),
             spheres.groups,
-            self.segment_tips,
             model.fiber_group,
-            model.segment_node,
             model.segment_fiber,
             state.lattice_now,
             pairs.out_start,
@@ -127,6 +142,7 @@ class NativeBonds:
             contacts.memory,
             contacts.written,
             self.contact_load,
+            self.contact_touch,
             state.status,
         ]
         kernel = make_native_capsule_pairs(p.name, contacts.features)
@@ -149,12 +165,13 @@ class NativeBonds:
         clock, dt = clock_launch(spheres), spheres.dt
         motion = spheres.press.motion()
         meter = [*spheres.press.meter(), *spheres.grips.meter(), *spheres.energies.losses()]
-        drift = self.launch(BEGIN)
+        drift = self.launch(BEGIN | FROM_NODES)
         drift.name = "drift"
-        self.touches.fill_(1)  # walls may have memories of a saved run
+        for touches in (self.touches, self.fiber_touches):
+            touches.fill_(1)  # walls may have memories of a saved run
         begin = [clock, *motion, drift]
         middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
-        end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END), *meter]
+        end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END | TO_NODES), *meter]
         if spheres.energies.told:
             middle = [*end, *begin]
         device, status = spheres.model.device, spheres.state.status

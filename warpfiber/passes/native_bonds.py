@@ -1,7 +1,8 @@
 """The sweeps over bonded spheres for the CPU: one block of fibers of one group at a time, SIMD.
 
 A lane is a fiber. The block's nodes are transposed from the state arrays into a scratch of vectors
-on the stack, the laws run on all lanes at once, and the nodes are transposed back. Loads of walls
+on the stack, the laws run on all lanes at once, and the nodes are transposed back. What no other
+sweep reads is kept as vectors from launch to launch (`node_blocks`). Loads of walls
 keep their one source: the laws of `node_walls` for the few nodes that touch one. Nothing in a lane
 depends on the other lanes, so it does not matter which fibers share a block.
 
@@ -21,7 +22,7 @@ import warp as wp
 from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import BondFeatures
-from warpfiber.passes.native_bonds_source import END, LANES, LOADS, bond_sweep_source
+from warpfiber.passes.native_bonds_source import END, FROM_NODES, LANES, LOADS, bond_sweep_source
 from warpfiber.passes.node_walls import make_node_walls
 
 LEAST_NODES, MOST_NODES = LANES, 256
@@ -29,9 +30,10 @@ LEAST_NODES, MOST_NODES = LANES, 256
 FIBERS_PER_BLOCK = 3
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    near_skin stage groups fiber_node_start fiber_group bond_axis bond_length node_hold node_load
-    node_grip contact_load node_touches node_push node_couple near_pos place node_pos node_velocity
-    node_turn node_spin node_rate node_spin_rate still_steps status block_fiber block_own
+    stage groups fiber_node_start fiber_group node_hold node_load node_grip contact_load
+    contact_touch fiber_extent fiber_touches node_touches node_push node_couple place node_pos
+    node_velocity node_turn node_spin node_rate node_spin_rate still_steps status block_fiber
+    block_own block_start block_axis block_length block_pos block_skin block_turn
 """.split()
 
 
@@ -66,21 +68,20 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         block: wp.int32,
         phase: wp.int32,
         dt: real,
-        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
-        bond_axis: wp.array(dtype=vec3),
-        bond_length: wp.array(dtype=real),
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
+        fiber_extent: wp.array(dtype=wp.float64),
+        fiber_touches: wp.array(dtype=wp.uint8),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -92,6 +93,12 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         status: wp.array(dtype=wp.int32),
         block_fiber: wp.array(dtype=wp.int32),
         block_own: wp.array(dtype=wp.int32),
+        block_start: wp.array(dtype=wp.int32),
+        block_axis: wp.array(dtype=real),
+        block_length: wp.array(dtype=real),
+        block_pos: wp.array(dtype=wp.float64),
+        block_skin: wp.array(dtype=real),
+        block_turn: wp.array(dtype=real),
     ): ...
 
     @wp.func
@@ -109,6 +116,21 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     return True
         return False
 
+    @wp.func
+    def is_beside_wall(
+        g: BondGroup,
+        fiber: wp.int32,
+        fiber_extent: wp.array(dtype=wp.float64),
+        wall_place: wp.array(dtype=wp.vec3d),
+    ) -> wp.bool:
+        """Whether some node of a fiber may touch a wall."""
+        low = wp.vec3d()
+        high = wp.vec3d()
+        for axis in range(3):
+            low[axis] = fiber_extent[6 * fiber + axis]
+            high[axis] = fiber_extent[6 * fiber + 3 + axis]
+        return is_at_wall(g, low, wall_place) or is_at_wall(g, high, wall_place)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def native_bond_sweep(
         offset: wp.int32,
@@ -118,24 +140,23 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         wall_velocity: wp.array(dtype=wp.vec2d),
         fiber_push: wp.array(dtype=wp.vec2d),
         wall_damping: real,
-        wall_friction: real,
+        wall_face: wp.array(dtype=vec4),
         wall_memory: wp.array(dtype=vec3),
         wall_depth: wp.array(dtype=real),
-        near_skin: wp.array(dtype=real),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
-        bond_axis: wp.array(dtype=vec3),
-        bond_length: wp.array(dtype=real),
         node_hold: wp.array(dtype=wp.int32),
         node_load: wp.array(dtype=vec3),
         node_grip: wp.array(dtype=vec3),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
+        fiber_extent: wp.array(dtype=wp.float64),
+        fiber_touches: wp.array(dtype=wp.uint8),
         node_touches: wp.array(dtype=wp.uint8),
         node_push: wp.array(dtype=vec3),
         node_couple: wp.array(dtype=vec3),
-        near_pos: wp.array(dtype=wp.vec3d),
         place: wp.array(dtype=wp.vec3d),
         node_pos_out: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -147,6 +168,12 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         status: wp.array(dtype=wp.int32),
         block_fiber: wp.array(dtype=wp.int32),
         block_own: wp.array(dtype=wp.int32),
+        block_start: wp.array(dtype=wp.int32),
+        block_axis: wp.array(dtype=real),
+        block_length: wp.array(dtype=real),
+        block_pos: wp.array(dtype=wp.float64),
+        block_skin: wp.array(dtype=real),
+        block_turn: wp.array(dtype=real),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -162,57 +189,64 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                     first = fiber_node_start[fiber]
                     last = fiber_node_start[fiber + 1] - 1
                     pushed = wp.vec2d()
-                    for i in range(first, last + 1):
-                        touches = is_at_wall(g, place[i], wall_place)
-                        # a node that has just left a wall has a memory to be cleared
-                        if not touches and node_touches[i] == wp.uint8(0):
-                            continue
-                        node_touches[i] = wp.uint8(touches)
-                        node = Node()
-                        node.x = place[i]
-                        node.v = node_velocity[i]
-                        node.w = node_spin[i]
-                        mass = g.mass
-                        if i == first or i == last:
-                            mass = g.end_mass
-                        push, couple, pushes = wall_loads(
-                            g,
-                            wall_damping,
-                            wall_friction,
-                            step,
-                            mass,
-                            i,
-                            node,
-                            wall_place,
-                            wall_velocity,
-                            wall_memory,
-                            wall_depth,
-                        )
-                        node_push[i] = push
-                        node_couple[i] = couple
-                        if wp.static(is_metered):
-                            pushed += pushes
+                    if (
+                        (phase & wp.static(FROM_NODES)) != 0
+                        or fiber_touches[fiber] != wp.uint8(0)
+                        or is_beside_wall(g, fiber, fiber_extent, wall_place)
+                    ):
+                        touched = wp.uint8(0)
+                        for i in range(first, last + 1):
+                            touches = is_at_wall(g, place[i], wall_place)
+                            # a node that has just left a wall has a memory to be cleared
+                            if not touches and node_touches[i] == wp.uint8(0):
+                                continue
+                            node_touches[i] = wp.uint8(touches)
+                            touched |= node_touches[i]
+                            node = Node()
+                            node.x = place[i]
+                            node.v = node_velocity[i]
+                            node.w = node_spin[i]
+                            mass = g.mass
+                            if i == first or i == last:
+                                mass = g.end_mass
+                            push, couple, pushes = wall_loads(
+                                g,
+                                wall_damping,
+                                wall_face,
+                                step,
+                                mass,
+                                i,
+                                node,
+                                wall_place,
+                                wall_velocity,
+                                wall_memory,
+                                wall_depth,
+                            )
+                            node_push[i] = push
+                            node_couple[i] = couple
+                            if wp.static(is_metered):
+                                pushed += pushes
+                        fiber_touches[fiber] = touched
                     if wp.static(is_metered):
                         fiber_push[fiber] = pushed
         sweep_block(
             block,
             phase,
             dt,
-            near_skin,
             stage,
             groups,
             fiber_node_start,
             fiber_group,
-            bond_axis,
-            bond_length,
             node_hold,
             node_load,
             node_grip,
             contact_load,
+            contact_touch,
+            fiber_extent,
+            fiber_touches,
             node_touches,
             node_push,
             node_couple,
-            near_pos,
             place,
             node_pos_out,
             node_velocity,
@@ -224,6 +258,12 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
             status,
             block_fiber,
             block_own,
+            block_start,
+            block_axis,
+            block_length,
+            block_pos,
+            block_skin,
+            block_turn,
         )
 
     return native_bond_sweep

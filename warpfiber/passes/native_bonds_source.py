@@ -2,9 +2,10 @@
 
 The laws of `bond` (`native_bond_law`) and `rotation`, one lane per fiber. Positions are float64 in
 every precision.
-Symbols: as in `bond`; T real, V and P vectors of T and double; x, v, q, w, a, b scratch of
-    positions, velocities, quaternions, spins, loads (then accelerations) and moments, one vector
-    per number of a node.
+Symbols: as in `bond`; T real, V and P vectors of T and double; x, v, w, a, b scratch of positions,
+    velocities, spins, loads (then accelerations) and moments, one vector per number of a node;
+    what only this sweep needs lies in memory like that: q quaternions, axis and length of bonds,
+    near and skin positions of the near list and skins of nodes.
 """
 
 import math
@@ -14,11 +15,13 @@ from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-from warpfiber.passes.native_capsules_source import LINE, PARTS
+from warpfiber.passes.native_capsules_source import PARTS
 
 LANES = 8  # fibers, in both precisions
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
+FROM_NODES, TO_NODES = 8, 16
+"""Turns are taken from the nodes before, and given to them after; else the blocks keep them."""
 
 
 def _constants(features: BondFeatures) -> str:
@@ -31,6 +34,8 @@ def _constants(features: BondFeatures) -> str:
         "HAS_GRIPS": features.grips,
     }
     lines = [f"constexpr bool {key} = {str(value).lower()};" for key, value in flags.items()]
+    walled = ", ".join(str(wall).lower() for wall in features.walls)
+    lines.append(f"constexpr bool IS_WALLED[3] = {{{walled}}};")
     tables = {
         "COSINE": [(-1.0) ** n / math.factorial(2 * n) for n in range(6)],
         "SINE": [(-1.0) ** n / math.factorial(2 * n + 1) for n in range(6)],
@@ -49,30 +54,31 @@ def _constants(features: BondFeatures) -> str:
         "IS_FREE": FREE,
         "IS_CLAMPED": CLAMPED,
         "IS_LOWER": LOWER,
-        "LINE": LINE,
         "PARTS": PARTS,
         "LOADS": LOADS,
         "END": END,
         "BEGIN": BEGIN,
+        "FROM_NODES": FROM_NODES,
+        "TO_NODES": TO_NODES,
     }
     lines += [f"constexpr int {key} = {value};" for key, value in slots.items()]
     return "\n".join(lines)
 
 
-# Loads of contacts: the parts of the pair sweep in turn, cleared for the next one.
+# Loads of contacts: the parts of the pair sweep in turn; a node without any has the first line, of
+# zeros.
 _GATHER = """
-    const long part = (long)LINE * node_count;
     for (int k = 0; k < nodes; ++k) {
         V r[W];
         #pragma unroll
         for (int l = 0; l < W; ++l) {
-            const T* from = contact_load + (long)LINE * (first[l] + k);
-            r[l] = *(const U*)from;
-            for (int p = 1; p < PARTS; ++p) r[l] += *(const U*)(from + p * part);
+            const long node = first[l] + k;
+            r[l] = load_lines[(1 + node) * contact_touch[node]];
+            for (int p = 1; p < PARTS; ++p) {
+                const long line = 1 + node + (long)node_count * p;
+                r[l] += load_lines[line * contact_touch[line - 1]];
+            }
         }
-        for (int l = 0; l < own; ++l)
-            for (int p = 0; p < PARTS; ++p)
-                *(U*)(contact_load + (long)LINE * (first[l] + k) + p * part) = V(T(0));
         TRANSPOSE
         #pragma unroll
         for (int c = 0; c < 3; ++c) {
@@ -80,6 +86,9 @@ _GATHER = """
             b[3 * k + c] = r[3 + c];
         }
     }
+    for (int l = 0; l < own; ++l)
+        for (int p = 0; p < PARTS; ++p)
+            __builtin_memset(contact_touch + first[l] + (long)node_count * p, 0, nodes);
 """
 
 _RATES = """
@@ -97,7 +106,7 @@ _RATES = """
                         ((T*)node_grip)[3L * (first[l] + k) + c] = ((T*)(a + 3 * k + c))[l];
     if constexpr (HAS_WALLS)
         for (int l = 0; l < own; ++l)
-            for (int k = 0; k < nodes; ++k)
+            for (int k = 0; fiber_touches[fiber[l]] && k < nodes; ++k)
                 if (node_touches[first[l] + k])
                     for (int c = 0; c < 3; ++c) {
                         const long from = 3L * (first[l] + k) + c;
@@ -142,6 +151,11 @@ _MOVE = """
     const V kick = V(T(0.5) * dt);
     V fastest2 = V(T(0));
     M expired = V(T(1)) < T(0);
+    P lowest[3], highest[3];
+    for (int c = 0; c < 3; ++c) {
+        lowest[c] = P(1e30);
+        highest[c] = P(-1e30);
+    }
     for (int k = 0; k < nodes; ++k) {
         V3 speed = get(v, k), spin = get(w, k);
         if (loads) {
@@ -163,6 +177,13 @@ _MOVE = """
             x[3 * k] = at.x;
             x[3 * k + 1] = at.y;
             x[3 * k + 2] = at.z;
+            #pragma unroll
+            for (int c = 0; c < 3; ++c)
+                if (IS_WALLED[c]) {
+                    const P here = x[3 * k + c];
+                    lowest[c] = here < lowest[c] ? here : lowest[c];
+                    highest[c] = here > highest[c] ? here : highest[c];
+                }
             const V3 turn = spin * kick;
             const V z = turn.dot(turn);
             V cosine = COSINE[3] + z * (COSINE[4] + z * COSINE[5]);
@@ -203,10 +224,16 @@ _MOVE = """
 _STORE = """
     store_V(3, (T*)node_velocity, v);
     store_V(3, (T*)node_spin, w);
+    if (phase & TO_NODES) store_V(4, (T*)node_turn, q);
     if (begins) {
         store_P(3, (double*)place, x);
-        store_V(4, (T*)node_turn, q);
         if (IS_SINGLE && HAS_PAIRS) store_V(3, (T*)node_pos, listed);
+        if constexpr (HAS_WALLS)
+            for (int l = 0; l < own; ++l)
+                for (int c = 0; c < 3; ++c) {
+                    fiber_extent[6 * fiber[l] + c] = ((const double*)(lowest + c))[l];
+                    fiber_extent[6 * fiber[l] + 3 + c] = ((const double*)(highest + c))[l];
+                }
         if (any(expired))
             for (int l = 0; l < own; ++l)
                 if (expired[l]) status[SLOT_EXPIRED] = 1;
@@ -227,19 +254,21 @@ _SWEEP = """
     const int segments = g.segments, nodes = segments + 1;
     int first[W];
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
+    const V* const load_lines = (const V*)contact_load;
     const bool loads = phase & LOADS, ends = phase & END, begins = phase & BEGIN;
 
-    P* x = (P*)__builtin_alloca_with_align(6 * nodes * sizeof(P), 512);
-    P* near = x + 3 * nodes;
-    V* v = (V*)__builtin_alloca_with_align(24 * nodes * sizeof(V), 512);
+    P* x = (P*)__builtin_alloca_with_align(3 * nodes * sizeof(P), 512);
+    V* v = (V*)__builtin_alloca_with_align(15 * nodes * sizeof(V), 512);
     V* w = v + 3 * nodes;
-    V* q = w + 3 * nodes;
-    V* a = q + 4 * nodes;
+    V* a = w + 3 * nodes;
     V* b = a + 3 * nodes;
-    V* axis = b + 3 * nodes;
-    V* length = axis + 3 * nodes;
-    V* skin = length + nodes;
-    V* listed = skin + nodes;
+    V* listed = b + 3 * nodes;
+    const long place_in = block_start[block];
+    const P* near = (const P*)block_pos + 3 * place_in;
+    const V* skin = (const V*)block_skin + place_in;
+    const V* axis = (const V*)block_axis + 3 * place_in;
+    const V* length = (const V*)block_length + place_in;
+    V* q = (V*)block_turn + 4 * place_in;
     struct P3 { P x, y, z; };
     struct V4 { V3 v; V s; };
     auto get = [](const V* u, int k) -> V3 { return V3{u[3 * k], u[3 * k + 1], u[3 * k + 2]}; };
@@ -259,15 +288,9 @@ _SWEEP = """
 _LOAD = """
     load_P(3, x, (const double*)place);
     load_V(3, v, (const T*)node_velocity);
-    load_V(4, q, (const T*)node_turn);
     load_V(3, w, (const T*)node_spin);
-    if (begins && HAS_PAIRS) {
-        load_P(3, near, (const double*)near_pos);
-        load_V(1, skin, near_skin);
-    }
+    if (phase & FROM_NODES) load_V(4, q, (const T*)node_turn);
     if (loads) {
-        load_V(3, axis, (const T*)bond_axis);
-        load_V(1, length, (const T*)bond_length);
         GATHER
         BONDS
     } else {

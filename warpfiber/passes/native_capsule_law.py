@@ -18,6 +18,7 @@ from warpfiber.laws.capsule_contact import (
 )
 from warpfiber.passes.pairs import END_TOLERANCE
 
+ALIGNED = LINE_COSINE**2 * (1.0 - 1e-5)  # squared cosine below which no pair can be a line
 # Terms of log((1 + f) / (1 - f)) up to f = 3 - sqrt(8), and of exp up to half a binary digit.
 LOG_TERMS = {"float64": 11, "float32": 5}
 EXP_TERMS = {"float64": 14, "float32": 8}
@@ -29,6 +30,7 @@ def contact_constants(name: str) -> str:
         "LINE_COSINE": LINE_COSINE,
         "LINE_PART": LINE_PART,
         "SMALLEST_SINE": SMALLEST_SINE,
+        "ALIGNED": ALIGNED,
         "SLENDER": SLENDER,
         "POWER": POWER,
         "NEAR": END_TOLERANCE[name],
@@ -97,6 +99,7 @@ POWERS = """
 """
 
 # Sets force, stiffness, s, t and depth of the lanes; no force where another pair has the contact.
+# Without HAS_LINE for pairs none of which can be a line.
 NORMAL = """
     const V reach = radius_i + radius_j;
     const V ki = T(1) / radius_i, kj = T(1) / radius_j;
@@ -109,11 +112,12 @@ NORMAL = """
     const V cosine = (ab < T(0) ? -ab : ab) * both;
     const V3 normal = a.cross(b);
     const V sine = larger(root(normal.dot(normal)) * both, V(SMALLEST_SINE));
-    const V factor0 = hertz_factor(ki + kj, ki * kj * sine * sine);
-
+    V factor = V(T(1));
     V force = V(T(0)), stiffness = V(T(0)), depth = V(T(0)), line_s = s, line_t = t;
-    M is_line = hit & (cosine > LINE_COSINE);
-    if (any(is_line)) {
+    M is_line = V(T(1)) < T(0);
+    if constexpr (HAS_LINE) is_line = hit & (cosine > LINE_COSINE);
+    if (HAS_LINE && any(is_line)) {
+        factor = hertz_factor(ki + kj, ki * kj * sine * sine);
         const V3 along = b * (ab < T(0) ? V(T(-1)) : V(T(1)));
         V3 middle = a * (T(1) / la) + along * (T(1) / lb);
         middle = middle * (T(1) / root(middle.dot(middle)));
@@ -150,7 +154,7 @@ NORMAL = """
         is_line &= T(2) * reach * deepest >= patch * patch;
         const M acts = is_line & (integral > T(0));
         const V length = la * root(T(0.5) * (T(1) + cosine));
-        const V k = modulus * factor0 * sine * length / root(T(2) * reach);
+        const V k = modulus * factor * sine * length / root(T(2) * reach);
         const V per_part = T(1) / (t1 - t0), beyond = T(0.5) * (T(1) + lb / la);
         const V ahead = -t0 * per_part, behind = (T(1) - t0) * per_part;
         const V lowest = smaller(V(T(0)), smaller(ahead, behind)) - beyond;
@@ -172,14 +176,13 @@ NORMAL = """
     reject |= low_i & ~tip0_i & (c0.dot(back_i) < -NEAR * back_i.dot(back_i));
     reject |= low_j & ~tip0_j & (c0.dot(back_j) > NEAR * back_j.dot(back_j));
     if (any(~reject)) {
-        V factor = factor0;
-        if (any((end_i | end_j) & ~reject)) {
-            const V total = ki + kj;
-            V sum = end_i ? ki + total : kj + total, product = end_i ? ki * total : kj * total;
-            sum = (end_i & end_j) ? T(2) * total : sum;
-            product = (end_i & end_j) ? total * total : product;
-            factor = (end_i | end_j) ? hertz_factor(sum, product) : factor;
-        }
+        const V total = ki + kj;
+        V sum = end_i ? ki + total : total, product = end_i ? ki * total : ki * kj * sine * sine;
+        sum = end_j ? kj + total : sum;
+        product = end_j ? kj * total : product;
+        sum = (end_i & end_j) ? T(2) * total : sum;
+        product = (end_i & end_j) ? total * total : product;
+        factor = hertz_factor(sum, product);
         const V deep = larger(reach - root(square0), V(T(0)));
         const V patch = root(T(2) * reach * deep) / sine, inverse = T(1) / patch;
         // a part where the fiber comes nearer again beyond a node: 0 at the node, 1 at its start

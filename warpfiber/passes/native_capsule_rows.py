@@ -66,10 +66,8 @@ _ROWS = """
         }
     };
     typedef int I __attribute__((ext_vector_type(W)));
-    auto add_images = [&](const int* ks, V3& delta) {
+    auto add_images = [&](I code, V3& delta) {
         if constexpr (IS_PERIODIC) {
-            I code;
-            for (int l = 0; l < W; ++l) ((int*)&code)[l] = pair_image[ks[l]];
             auto number = [&](int bits) -> V {
                 return __builtin_convertvector(((code >> bits) & MASK) - HALF, V);
             };
@@ -83,9 +81,11 @@ _ROWS = """
 """
 
 
-# Edges, distance vector and closest points of the pairs `ks`, from segments that begin at nodes.
+# Distance vector and closest points of pairs of segments that begin at nodes; whether they are
+# nearly parallel, with a margin for rounding.
 DISTANCE = """
-    auto closest = [&](const int* ks, const int* node_i, const int* node_j, V& s, V& t) -> V3 {
+    auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t, M& aligned)
+        -> V3 {
         P4 rows_a[W], rows_b[W], rows_d[W];
         for (int l = 0; l < W; ++l) {
             const P4 xi = place_row(node_i[l]), xj = place_row(node_j[l]);
@@ -95,9 +95,10 @@ DISTANCE = """
         }
         const V3 a = turn(rows_a), b = turn(rows_b);
         V3 delta = turn(rows_d);
-        add_images(ks, delta);
+        add_images(images, delta);
         const V aa = larger(a.dot(a), V(TINY)), bb = larger(b.dot(b), V(TINY));
         const V ab = a.dot(b), da = delta.dot(a), db = delta.dot(b);
+        aligned = ab * ab > T(ALIGNED) * aa * bb;
         const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
         s = clamp01((da * bb - db * ab) / den);
         t = clamp01((s * ab - db) / bb);

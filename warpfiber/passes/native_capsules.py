@@ -20,9 +20,9 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 
 # Arguments of the sweep that are arrays.
 ARRAYS = """
-    groups segment_tips fiber_group segment_node segment_fiber lattice out_start part_start
-    near_count near_pair near_i near_j pair_i pair_j pair_image place node_velocity node_spin step
-    pair_acts pair_force pair_moment pair_arms pair_memory pair_step contact_load status
+    groups fiber_group segment_fiber lattice out_start part_start near_count near_pair near_i near_j
+    near_image pair_i pair_j pair_image place node_velocity node_spin step pair_acts pair_force
+    pair_moment pair_arms pair_memory pair_step contact_load contact_touch status
 """.split()
 
 
@@ -42,9 +42,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         friction: real,
         largest_reach: real,
         groups: wp.array(dtype=BondGroup),
-        segment_tips: wp.array(dtype=wp.uint8),
         fiber_group: wp.array(dtype=wp.int32),
-        segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
@@ -53,6 +51,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         near_pair: wp.array(dtype=wp.int32),
         near_i: wp.array(dtype=wp.int32),
         near_j: wp.array(dtype=wp.int32),
+        near_image: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -67,6 +66,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=wp.int32),
     ): ...
 
@@ -79,9 +79,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         friction: real,
         largest_reach: real,
         groups: wp.array(dtype=BondGroup),
-        segment_tips: wp.array(dtype=wp.uint8),
         fiber_group: wp.array(dtype=wp.int32),
-        segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
@@ -90,6 +88,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         near_pair: wp.array(dtype=wp.int32),
         near_i: wp.array(dtype=wp.int32),
         near_j: wp.array(dtype=wp.int32),
+        near_image: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -104,6 +103,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         contact_load: wp.array(dtype=real),
+        contact_touch: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=wp.int32),
     ):
         sweep_part(
@@ -114,9 +114,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             friction,
             largest_reach,
             groups,
-            segment_tips,
             fiber_group,
-            segment_node,
             segment_fiber,
             lattice,
             out_start,
@@ -125,6 +123,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             near_pair,
             near_i,
             near_j,
+            near_image,
             pair_i,
             pair_j,
             pair_image,
@@ -139,6 +138,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             pair_memory,
             pair_step,
             contact_load,
+            contact_touch,
             status,
         )
 

@@ -1,9 +1,10 @@
 """C++ text of the SIMD sweep over listed pairs of bonded spheres (`native_capsules`).
 
-Distances of eight listed pairs at a time; pairs within reach are collected and have the law of
-contact eight at a time, normal (`native_capsule_law`) and tangential as in `capsule_pairs` and
-`friction`. A memory that must be handed over is looked for pair by pair: that is rare.
-Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list.
+Distances of LANES near pairs at a time; pairs within reach are collected, those that are aligned
+apart, and have the law of contact LANES at a time, normal (`native_capsule_law`) and tangential as
+in `capsule_pairs` and `friction`. What waits for its law is fetched into the cache meanwhile. A
+memory that must be handed over is looked for pair by pair: that is rare.
+Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list, `at` among near pairs.
 """
 
 from warpfiber.laws.hertz import DASHPOT
@@ -16,7 +17,8 @@ from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_
 # Pairs in both precisions: two registers of eight numbers hide each other's latency.
 LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
-LINE = 8  # numbers per node and part: force, moment, two unused
+TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
+LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
 
 def capsule_constants(name: str, features: CapsuleFeatures) -> str:
@@ -30,7 +32,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
     lines.append(f"constexpr T DASHPOT = T({DASHPOT!r}), EPS = T({precision(name).eps!r});")
     numbers = {
         "PARTS": PARTS,
-        "LINE": LINE,
+        "TIP_BITS": TIP_BITS,
         "SLOT_HALT": HALT,
     }
     numbers |= image_constants()
@@ -66,18 +68,23 @@ _HAND_OVER = """
     };
 """
 
-# Eight pairs within reach, of which the first `count` count.
+# Pairs within reach, the near ones `ats`, of which the first `count` count.
 _LAW = """
-    auto law = [&](const int* ks, const T* ss, const T* ts, int count) __attribute__((noinline)) {
+    auto law = [&](auto kind, const int* ats, const T* ss, const T* ts, int count)
+        __attribute__((noinline)) {
+        constexpr bool HAS_LINE = decltype(kind)::HAS_LINE;
         P4 rows_a[W], rows_b[W], rows_d[W], rows_bi[W], rows_ai[W], rows_bj[W], rows_aj[W];
-        int node_i[W], node_j[W];
-        T tips[4][W];
+        int ks[W], node_i[W], node_j[W];
+        I code_i, code_j, images;
         for (int l = 0; l < W; ++l) {
-            const int i = pair_i[ks[l]], j = pair_j[ks[l]];
-            const long at_i = node_i[l] = segment_node[i], at_j = node_j[l] = segment_node[j];
-            const int tip_i = segment_tips[i], tip_j = segment_tips[j];
-            const int first_i = tip_i & 1, last_i = tip_i >> 1;
-            const int first_j = tip_j & 1, last_j = tip_j >> 1;
+            const int at = ats[l], of_i = near_i[at], of_j = near_j[at];
+            ks[l] = near_pair[at];
+            ((int*)&code_i)[l] = of_i;
+            ((int*)&code_j)[l] = of_j;
+            ((int*)&images)[l] = near_image[at];
+            const long at_i = node_i[l] = of_i >> TIP_BITS, at_j = node_j[l] = of_j >> TIP_BITS;
+            const int first_i = of_i & 1, last_i = of_i >> 1 & 1;
+            const int first_j = of_j & 1, last_j = of_j >> 1 & 1;
             const P4 xi = place_row(at_i), xi1 = place_row(at_i + 1);
             const P4 xj = place_row(at_j), xj1 = place_row(at_j + 1);
             rows_a[l] = xi1 - xi;
@@ -87,24 +94,7 @@ _LAW = """
             rows_ai[l] = place_row(at_i + 2 - last_i) - xi1;
             rows_bj[l] = xj - place_row(at_j - 1 + first_j);
             rows_aj[l] = place_row(at_j + 2 - last_j) - xj1;
-            tips[0][l] = T(first_i);
-            tips[1][l] = T(last_i);
-            tips[2][l] = T(first_j);
-            tips[3][l] = T(last_j);
         }
-        if constexpr (HAS_DASHPOT || HAS_FRICTION)  // needed when the normal law is done
-            for (int l = 0; l < W; ++l)
-                for (int end = 0; end < 2; ++end) {
-                    const long far = 3L * (node_j[l] + end);
-                    __builtin_prefetch((const T*)node_velocity + far);
-                    __builtin_prefetch((const T*)node_spin + far);
-                    __builtin_prefetch(load + (long)LINE * (node_j[l] + end), 1);
-                }
-        if constexpr (HAS_FRICTION)
-            for (int l = 0; l < W; ++l) {
-                __builtin_prefetch(kept_last + 4L * ks[l]);
-                __builtin_prefetch(kept_now + 4L * ks[l], 1);
-            }
         auto of = [](const T* from) -> V {
             V v;
             __builtin_memcpy(&v, from, sizeof(V));
@@ -121,19 +111,17 @@ _LAW = """
         #define OF(owner, name) constant(owner, [](const auto& g) -> T { return g.name; })
         const V3 a = turn(rows_a), b = turn(rows_b);
         V3 delta = turn(rows_d);
-        add_images(ks, delta);
+        add_images(images, delta);
         const V3 back_i = turn(rows_bi), ahead_i = turn(rows_ai);
         const V3 back_j = turn(rows_bj), ahead_j = turn(rows_aj);
-        const M tip0_i = of(tips[0]) > T(0), tip1_i = of(tips[1]) > T(0);
-        const M tip0_j = of(tips[2]) > T(0), tip1_j = of(tips[3]) > T(0);
+        const M tip0_i = tipped(code_i, 1), tip1_i = tipped(code_i, 2);
+        const M tip0_j = tipped(code_j, 1), tip1_j = tipped(code_j, 2);
         const V radius_i = OF(pair_i, radius), radius_j = OF(pair_j, radius);
         const V compliance_i = OF(pair_i, compliance), compliance_j = OF(pair_j, compliance);
         V s = of(ss), t = of(ts);
         NORMAL
         const M acts = force > T(0);
-        typedef bool B __attribute__((ext_vector_type(W)));
-        const B bits = __builtin_convertvector(acts, B);
-        const unsigned mine = __builtin_bit_cast(unsigned short, bits) & ((1u << count) - 1u);
+        const unsigned mine = bits(acts) & ((1u << count) - 1u);
         if (mine == 0) return;
 
         const V3 c = delta + b * t - a * s;
@@ -182,10 +170,10 @@ _LAW = """
                     if (__builtin_expect(written_last[from] != last, 0)) {
                         const int i = pair_i[from], j = pair_j[from];
                         const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
-                        const int to_i = s_l < T(0.5) ? -(tips[0][l] == T(0))
-                                                      : (tips[1][l] == T(0));
-                        const int to_j = t_l < T(0.5) ? -(tips[2][l] == T(0))
-                                                      : (tips[3][l] == T(0));
+                        const int tips_i = ~((const int*)&code_i)[l];
+                        const int tips_j = ~((const int*)&code_j)[l];
+                        const int to_i = s_l < T(0.5) ? -(tips_i & 1) : tips_i >> 1 & 1;
+                        const int to_j = t_l < T(0.5) ? -(tips_j & 1) : tips_j >> 1 & 1;
                         from = neighbors_memory(
                             from, i + to_i, j + to_j, ((const T*)&far_i)[l], ((const T*)&far_j)[l]);
                         if (from < 0) continue;
@@ -230,8 +218,10 @@ _LAW = """
         for (unsigned left = mine; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             auto add = [&](int node, T8 values) {
-                typedef T U8 __attribute__((ext_vector_type(8), aligned(sizeof(T))));
-                *(U8*)(load + (long)LINE * node) += values;
+                // the line of a node without loads yet is not the first one, which is of zeros
+                T8* const line = load + node;
+                *line = load_lines[(part_line + node) * touch[node]] + values;
+                touch[node] = 1;
             };
             const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
             add(node_i[l], on_i[l] * (T(1) - s_l));
@@ -239,12 +229,12 @@ _LAW = """
             add(node_j[l], on_j[l] * (T(1) - t_l));
             add(node_j[l] + 1, on_j[l] * t_l);
             const long k = ks[l];
-            pair_acts[k] = 1;
             if constexpr (HAS_FRICTION) {
                 for (int p = 0; p < 4; ++p) kept_now[4 * k + p] = h_out[p][l];
                 written_now[k] = now;
             }
             if (keeps) {
+                pair_acts[k] = 1;
                 T* f = (T*)pair_force + 3 * k;
                 T* m = (T*)pair_moment + 3 * k;
                 T* arms = (T*)pair_arms + 4 * k;
@@ -263,47 +253,74 @@ _LAW = """
 
 _SWEEP = """
     const int begin = out_start[part_start[part]], end = begin + near_count[part];
+    if (keeps) __builtin_memset(pair_acts + begin, 0, out_start[part_start[part + 1]] - begin);
+    struct Point { enum { HAS_LINE = false }; };
+    struct Line { enum { HAS_LINE = true }; };
     constexpr int ROOM = 2 * W;
-    int hit_k[ROOM], hits = 0;
-    T hit_s[ROOM], hit_t[ROOM];
+    // pairs that may touch along a line lie behind those that touch at a point
+    int hit_at[2 * ROOM], points = 0, lines = 0;
+    T hit_s[2 * ROOM], hit_t[2 * ROOM];
+    auto run = [&](auto kind, int from, int& hits) {
+        law(kind, hit_at + from, hit_s + from, hit_t + from, W);
+        hits -= W;
+        for (int l = from; l < from + hits; ++l) {
+            hit_at[l] = hit_at[W + l];
+            hit_s[l] = hit_s[W + l];
+            hit_t[l] = hit_t[W + l];
+        }
+    };
+    auto run_rest = [&](auto kind, int from, int hits) {
+        if (hits == 0) return;
+        for (int l = from + hits; l < from + W; ++l) {
+            hit_at[l] = hit_at[from];
+            hit_s[l] = hit_s[from];
+            hit_t[l] = hit_t[from];
+        }
+        law(kind, hit_at + from, hit_s + from, hit_t + from, hits);
+    };
     for (int first = begin; first < end; first += W) {
         const int count = end - first < W ? end - first : W;
-        int ks[W], from_i[W], from_j[W];
-        for (int l = 0; l < W; ++l) {
-            const int at = first + (l < count ? l : count - 1);
-            ks[l] = near_pair[at];
-            from_i[l] = near_i[at];
-            from_j[l] = near_j[at];
-            pair_acts[ks[l]] = 0;
-        }
+        I code_i, code_j, images;
+        __builtin_memcpy(&code_i, near_i + first, sizeof(I));
+        __builtin_memcpy(&code_j, near_j + first, sizeof(I));
+        __builtin_memcpy(&images, near_image + first, sizeof(I));
+        const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
+        for (int l = 0; l < W; ++l)
+            __builtin_prefetch((const double*)place + 3L * (near_j[first + W + l] >> TIP_BITS));
         V s, t;
-        const V3 c = closest(ks, from_i, from_j, s, t);
-        const M near = c.dot(c) < largest_reach * largest_reach;
-        // without branches: about every second pair is a hit
-        for (int l = 0; l < W; ++l) {
-            hit_k[hits] = ks[l];
-            hit_s[hits] = s[l];
-            hit_t[hits] = t[l];
-            hits += near[l] ? (l < count) : 0;
-        }
-        if (hits >= W) {
-            law(hit_k, hit_s, hit_t, W);
-            hits -= W;
-            for (int l = 0; l < hits; ++l) {
-                hit_k[l] = hit_k[W + l];
-                hit_s[l] = hit_s[W + l];
-                hit_t[l] = hit_t[W + l];
+        M aligned;
+        const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aligned);
+        // at the far end of a segment that has a next one, that one has the contact
+        M next = (s >= T(1) - NEAR) & ~tipped(code_i, 2);
+        next |= (t >= T(1) - NEAR) & ~tipped(code_j, 2);
+        const M hit = (c.dot(c) < largest_reach * largest_reach) & (aligned | ~next);
+        const unsigned line = bits(aligned);
+        for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            const int slot = line >> l & 1 ? ROOM + lines++ : points++;
+            hit_at[slot] = first + l;
+            hit_s[slot] = ((const T*)&s)[l];
+            hit_t[slot] = ((const T*)&t)[l];
+            const long k = near_pair[first + l];
+            const long i = ((const int*)&from_i)[l], j = ((const int*)&from_j)[l];
+            if constexpr (HAS_DASHPOT || HAS_FRICTION) {
+                __builtin_prefetch((const T*)node_velocity + 3 * i);
+                __builtin_prefetch((const T*)node_velocity + 3 * j);
+                __builtin_prefetch((const T*)node_spin + 3 * i);
+                __builtin_prefetch((const T*)node_spin + 3 * j);
+            }
+            __builtin_prefetch(load + j, 1);
+            __builtin_prefetch(load + j + 1, 1);
+            if constexpr (HAS_FRICTION) {
+                __builtin_prefetch(kept_last + 4 * k);
+                __builtin_prefetch(kept_now + 4 * k, 1);
             }
         }
+        if (points >= W) run(Point(), 0, points);
+        if (lines >= W) run(Line(), ROOM, lines);
     }
-    if (hits > 0) {
-        for (int l = hits; l < W; ++l) {
-            hit_k[l] = hit_k[0];
-            hit_s[l] = hit_s[0];
-            hit_t[l] = hit_t[0];
-        }
-        law(hit_k, hit_s, hit_t, hits);
-    }
+    run_rest(Point(), 0, points);
+    run_rest(Line(), ROOM, lines);
 """
 
 
@@ -321,8 +338,18 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     {contact_constants(name)}
     if (status[SLOT_HALT] != 0) return;
     const V3 nothing3 = same3(0, 0, 0);
-    T* const load = contact_load + (long)LINE * node_count * part;
     {row_source()}
+    typedef bool B __attribute__((ext_vector_type(W)));
+    auto bits = [](M m) -> unsigned {{
+        return __builtin_bit_cast(unsigned short, __builtin_convertvector(m, B));
+    }};
+    auto tipped = [](I code, int tip) -> M {{
+        return __builtin_convertvector((code & tip) != 0, M);
+    }};
+    T8* const load_lines = (T8*)contact_load;
+    const long part_line = 1 + (long)node_count * part;
+    T8* const load = load_lines + part_line;
+    wp::uint8* const touch = contact_touch + (long)node_count * part;
     {POWERS}
     {_HAND_OVER}
     {DISTANCE}

@@ -17,19 +17,23 @@ _NEAR = """
         const int count = end - first < W ? end - first : W;
         int ks[W], from_i[W], from_j[W];
         V reach;
+        I images;
         for (int l = 0; l < W; ++l) {
             const int k = ks[l] = first + (l < count ? l : count - 1);
             from_i[l] = segment_node[pair_i[k]];
             from_j[l] = segment_node[pair_j[k]];
+            ((int*)&images)[l] = pair_image[k];
             ((T*)&reach)[l] = largest_reach + skin_of(from_i[l]) + skin_of(from_j[l]);
         }
         V s, t;
-        const V3 c = closest(ks, from_i, from_j, s, t);
+        M aligned;
+        const V3 c = closest(images, from_i, from_j, s, t, aligned);
         const M near = c.dot(c) <= reach * reach;
         for (int l = 0; l < count; ++l) {
             near_pair[found] = ks[l];
-            near_i[found] = from_i[l];
-            near_j[found] = from_j[l];
+            near_i[found] = from_i[l] << TIP_BITS | segment_tips[pair_i[ks[l]]];
+            near_j[found] = from_j[l] << TIP_BITS | segment_tips[pair_j[ks[l]]];
+            near_image[found] = ((const int*)&images)[l];
             found += near[l] ? 1 : 0;
         }
     }
@@ -45,7 +49,7 @@ def near_list_source(name: str, features: CapsuleFeatures, arrays: list[str]) ->
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
     {capsule_constants(name, features)}
-    constexpr T TINY = T(1e-30);
+    constexpr T TINY = T(1e-30), ALIGNED = T(1);
     {row_source()}
     auto larger = [](V x, V y) -> V {{ return x > y ? x : y; }};
     auto clamp01 = [](V x) -> V {{

@@ -18,19 +18,21 @@ import warp as wp
 
 from warpfiber.model import precision
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.native_bonds_source import LANES
 from warpfiber.passes.native_capsules_source import PARTS
 from warpfiber.passes.native_near_source import near_list_source
 
-# Chosen by trials on a bed of 500 fibers of 26 segments under a plate; not swept in quiet.
+# Trials on a bed of 500 fibers of 26 segments under a plate: LEAST from 0.012 to 0.05 and LASTING
+# from 12 to 20 cost the same to the scatter of 5 %; lists at a PAIR_COST of 0.3 half of those at 1.
 LEAST = 0.025  # skin of a node at rest, diameters
 LASTING = 20.0  # steps that a skin is made for
 ENOUGH = 5.0  # steps; where the list leaves less, it is built anew
 ONE_STEP = 1.5  # steps that any skin must last
-PAIR_COST = 1.0  # as `skin.PAIR_COST`: a listed pair is looked at when near ones are found
+PAIR_COST = 0.3  # as `skin.PAIR_COST`: a listed pair is looked at when near ones are found
 # Arguments of `list_near` that are arrays.
 ARRAYS = """
-    segment_node lattice out_start part_start pair_i pair_j pair_image place near_skin near_pair
-    near_i near_j near_count
+    segment_node segment_tips lattice out_start part_start pair_i pair_j pair_image place near_skin
+    near_pair near_i near_j near_image near_count
 """.split()
 
 
@@ -58,6 +60,9 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
         node_velocity: wp.array(dtype=vec3),
         near_pos_out: wp.array(dtype=wp.vec3d),
         near_skin_out: wp.array(dtype=real),
+        node_slot: wp.array(dtype=wp.int32),
+        block_pos_out: wp.array(dtype=wp.float64),
+        block_skin_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
     ):
         i = wp.tid() + offset
@@ -71,12 +76,18 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
             short_out[1] = 1
         near_pos_out[i] = x
         near_skin_out[i] = wp.max(skin, real(0.0))
+        slot = node_slot[i]
+        first = 3 * slot - 2 * (slot % wp.static(LANES))
+        for axis in range(3):
+            block_pos_out[first + wp.static(LANES) * axis] = x[axis]
+        block_skin_out[slot] = near_skin_out[i]
 
     @wp.func_native(near_list_source(name, features, ARRAYS))
     def find_near(
         part: wp.int32,
         largest_reach: real,
         segment_node: wp.array(dtype=wp.int32),
+        segment_tips: wp.array(dtype=wp.uint8),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
         part_start: wp.array(dtype=wp.int32),
@@ -88,6 +99,7 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
         near_pair: wp.array(dtype=wp.int32),
         near_i: wp.array(dtype=wp.int32),
         near_j: wp.array(dtype=wp.int32),
+        near_image: wp.array(dtype=wp.int32),
         near_count: wp.array(dtype=wp.int32),
     ): ...
 
@@ -96,6 +108,7 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
         offset: wp.int32,
         largest_reach: real,
         segment_node: wp.array(dtype=wp.int32),
+        segment_tips: wp.array(dtype=wp.uint8),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
         part_start: wp.array(dtype=wp.int32),
@@ -107,12 +120,14 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
         near_pair_out: wp.array(dtype=wp.int32),
         near_i_out: wp.array(dtype=wp.int32),
         near_j_out: wp.array(dtype=wp.int32),
+        near_image_out: wp.array(dtype=wp.int32),
         near_count_out: wp.array(dtype=wp.int32),
     ):
         find_near(
             wp.tid() + offset,
             largest_reach,
             segment_node,
+            segment_tips,
             lattice,
             out_start,
             part_start,
@@ -124,6 +139,7 @@ def make_near_pairs(name: str, features: CapsuleFeatures):
             near_pair_out,
             near_i_out,
             near_j_out,
+            near_image_out,
             near_count_out,
         )
 
