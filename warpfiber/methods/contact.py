@@ -159,6 +159,7 @@ class ImplicitContact:
                 tolerance=tolerance * min(radii),
                 law=contact_law(scene, model),
                 fiber_frozen=fiber_frozen,
+                tells_push=load is not None,
             )
             self.solves.append((rows, dual))
         self.check = ContactCheck(
