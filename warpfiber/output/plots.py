@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Table = dict[str, NDArray[Any]]
 TIP_FIBERS = 10  # more curves than this say nothing
-COVERS = 0.02  # curves nearer than this part of their largest value look like one
+COVERS = 0.02  # curves as near as this part of their largest value in the mean look like one
 _DPI = 160
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -180,7 +180,7 @@ def _is_covered(curves: Curves, run: _Run, name: str) -> bool:
     names, y = _known(curves, run), run.table[name].astype(float)
     least = COVERS * float(np.nanmax(np.abs(y)))
     apart = [np.abs(run.table[other] - y) for other in names[names.index(name) + 1 :]]
-    return any(float(np.nanmax(way)) <= least for way in apart)
+    return any(float(np.nanmean(way)) <= least for way in apart)
 
 
 def _draw_curves(
