@@ -18,6 +18,7 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.bead_rows import make_bead_rows
 from warpfiber.passes.pairs import NO_IMAGE, PairFeatures, make_pair_geometry
+from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import (
     SLOTS,
@@ -110,7 +111,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         """`keep` in radii of the thinner fiber, `widest` the largest radius of all."""
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
+        i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
         node_i = segment_node[i]
         xi = node_back[node_i]
         a = node_back[node_i + 1] - xi

@@ -16,6 +16,7 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.bead_rows import make_bead_rows
 from warpfiber.passes.pairs import PairFeatures, make_image, make_pair_geometry
+from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_count import RowFeatures
 from warpfiber.passes.row_geometry import SLOTS, make_row_geometry, make_wall_gap
@@ -116,7 +117,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
     ):
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
+        i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
         if row_need[0] > 0:  # rows that do not fit are none
             row_out_start[i + 1] = 0
             for k in range(out_start[i], out_start[i + 1]):
