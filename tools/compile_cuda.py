@@ -253,7 +253,10 @@ def kernels(precision: str) -> Iterator[tuple[str, str, Any]]:
     yield "capsule_pairs", "everything", make_capsule_pairs(precision, rubbing)
     rings = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
     yield "capsule_pairs", "rings", make_capsule_pairs(precision, rings)
-    yield "carry_memory", "", make_carry_memory(precision, True)
+    for name, kernel in zip(
+        ("keep_memory", "carry_memory"), make_carry_memory(precision, True), strict=True
+    ):
+        yield name, "", kernel
     yield "move_walls", "", make_wall_motion(2)
     yield "sum_pushes", "", make_push_sum()
     yield "meter_walls", "", make_wall_meter(2)
