@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from warpfiber.methods.bond_constants import is_closed
 from warpfiber.output.columns import write_columns
 from warpfiber.output.folder import ResultFolder
 from warpfiber.output.placement_table import write_placement
@@ -60,6 +61,7 @@ class Recording:
                 folder.trajectory_path,
                 fiber_node_start=simulation.fiber_node_start,
                 fiber_group=simulation.model.host["fiber_group"],
+                closed_groups=[is_closed(group) for group in scene.fibers],
                 scene_json=json.dumps(scene.as_dict()),
                 attrs=attrs,
                 node_fields=[f"node_{name}" for name in scene.record.node_fields],

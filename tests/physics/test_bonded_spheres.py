@@ -131,8 +131,8 @@ def test_long_undamped_flight() -> None:
     )
     last = ref.momentum(rod, end)
     scale = begin / 3.0
-    assert np.abs(last[0] - first[0]).max() < 1e-11 * scale
-    assert np.abs(last[1] - first[1]).max() < 1e-11 * scale
+    assert np.abs(last[0] - first[0]).max() < 1e-12 * scale
+    assert np.abs(last[1] - first[1]).max() < 1e-12 * scale * LENGTH
 
 
 def test_spin_of_a_curved_fiber() -> None:

@@ -15,15 +15,17 @@ RADIUS, STEP = 1.2e-3, 2.4e-3
 DEPTH, SPEED, N = 1e-4, 0.1, 20
 
 
-def dragged(degrees: float, friction: float, velocity: list[float], part: float) -> Simulation:
+def dragged(
+    degrees: float, friction: float, velocity: list[float], part: float, step: float = STEP
+) -> Simulation:
     """A prescribed fiber on a fixed one along x; they cross at the part `part` of a segment."""
     angle = math.radians(degrees)
-    first = np.array([0.5, 0.5, 0.5]) + np.outer(np.arange(N + 1) * STEP, [1.0, 0.0, 0.0])
+    first = np.array([0.5, 0.5, 0.5]) + np.outer(np.arange(N + 1) * step, [1.0, 0.0, 0.0])
     along = np.array([math.cos(angle), math.sin(angle), 0.0])
-    cross = first[0] + [(N // 2 + part) * STEP, 0.0, 2.0 * RADIUS - DEPTH]
-    second = cross + np.outer((np.arange(N + 1) - N // 2 - 0.4) * STEP, along)
+    cross = first[0] + [(N // 2 + part) * step, 0.0, 2.0 * RADIUS - DEPTH]
+    second = cross + np.outer((np.arange(N + 1) - N // 2 - 0.4) * step, along)
     frozen = {"diameter": 2.0 * RADIUS, "density": 1340.0, "youngs_modulus": 7.5e5, "frozen": True}
-    row = {**frozen, "count": 1, "centerline_length": N * STEP, "orientation": "aligned"}
+    row = {**frozen, "count": 1, "centerline_length": N * step, "orientation": "aligned"}
     return start_rods(
         [ref.Rod(nodes, RADIUS, caps="capsule") for nodes in (first, second)],
         fibers=[row | {"position": [0.01, 0.01, 0.01]} for _ in range(2)],
@@ -54,11 +56,17 @@ def pulls(sim: Simulation, steps: int, every: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "velocity", [[SPEED, 0.0, 0.0], [-SPEED, 0.0, 0.0], [0.8 * SPEED, 0.6 * SPEED, 0.0]]
+    ("velocity", "step"),
+    [
+        ([SPEED, 0.0, 0.0], STEP),
+        ([-SPEED, 0.0, 0.0], STEP),
+        ([0.8 * SPEED, 0.6 * SPEED, 0.0], STEP),
+        ([0.8 * SPEED, 0.6 * SPEED, 0.0], 0.5 * STEP),  # the shortest that there may be
+    ],
 )
-def test_sliding_over_nodes(velocity: list[float]) -> None:
+def test_sliding_over_nodes(velocity: list[float], step: float) -> None:
     """mu times a constant normal force over nodes of both fibers; k eps of coordinates of 0.5 m."""
-    sim = dragged(90.0, 0.3, velocity, 0.2)
+    sim = dragged(90.0, 0.3, velocity, 0.2, step)
     _, normal, drag = pulls(sim, 4000, 7)[:, 30:]  # 8 mm, without the first sticking
     assert np.ptp(normal) < 1e-9 * normal[0]
     assert np.abs(drag / normal - 0.3).max() < 1e-9

@@ -137,7 +137,6 @@ FAULTS = {
     "tilted": ({"wall": {"axis": [0, 1, 1]}}, "wall.0.axis", "upright"),
     "out of the box": ({"wall": {"radius": 0.03}}, "wall.0.radius", "reaches out of the box"),
     "too high": ({"wall": {"height": 0.2}}, "wall.0.height", "reaches out of the box"),
-    "friction": ({"wall": {"friction": 0.1}}, "wall.0.friction", "wall_friction"),
     "moving": ({"wall": {"velocity": [0, 0, 1.0]}}, "wall.0.velocity", "stand still"),
     "thick": (
         {"wall": {"radius": 1e-3}},

@@ -70,6 +70,19 @@ def on_a_plane(fraction: float) -> Simulation:
     )
 
 
+def on_a_belt(fraction: float) -> Simulation:
+    """A fiber on a wall that moves beneath it."""
+    return start_rods(
+        [rod([0.5, 0.5, 0.99 * RADIUS], 30.0, 6)],
+        box=WALLS,
+        contact={"law": "none", "damping": 0.113, "wall_friction": 0.4},
+        gravity={},
+        wall=[{"name": "z-", "velocity": [0.2, 0.0, 0.0]}],
+        numerics={"dt_fraction": fraction},
+        quantities=["energy"],
+    )
+
+
 def squeezed(fraction: float) -> Simulation:
     """Three crossed fibers between walls, of which the upper one comes down."""
     rods = [rod([0.5, 0.5, (0.99 + 1.98 * k) * RADIUS], 90.0 * k, 7) for k in range(3)]
@@ -88,6 +101,7 @@ def squeezed(fraction: float) -> Simulation:
 CASES: dict[str, tuple[Callable[[float], Simulation], float, float]] = {
     "crossing": (crossing, 0.01, 1e-3),
     "on a plane": (on_a_plane, 0.03, 3e-3),
+    "on a belt": (on_a_belt, 0.03, 3e-3),
     "squeezed": (squeezed, 0.01, 2e-4),
 }
 

@@ -150,3 +150,14 @@ def test_a_rod_that_tumbles_over_an_array_moves_as_over_a_plane(diameter: float)
     assert 0.1 * depth < lower < 9.0 * depth
     # the forces of both sides are equal to the tolerance of contact
     np.testing.assert_allclose(ends[2][:, 1], 0.0, atol=1e-6)
+
+
+def test_lubricated_fibers_between_arrays() -> None:
+    """Rows of beads and of arrays in one cell: fibers stay out of both arrays."""
+    fibers = {"count": 20, "aspect_ratio": 10, "diameter": 2.0, "youngs_modulus": 1e5}
+    tables = cell_tables("rigid_rod", 2.0, fibers=[fibers], contact={"lubrication": "paper"})
+    sim = Simulation(scene_from_dict(tables))
+    for _ in range(5):
+        sim.step(10)
+        assert least_distance(sim, 2, 2.0, 1.0) > 2.0 - 0.05
+    assert sim.strain > 0.5

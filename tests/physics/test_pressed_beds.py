@@ -347,5 +347,6 @@ def test_a_pressure_never_reached(tmp_path: Path) -> None:
     assert job.run() == 3
     failure = json.loads((tmp_path / "out" / "summary.json").read_text())["failure"]
     assert "stage 'compress'" in failure["message"] and "as far as it can" in failure["message"]
+    assert "not met: end_pressure = 1e+09 Pa; it is" in failure["message"]
     with pytest.raises(SceneError, match="as far as it can"):
         Simulation(wf.load_scene(path, keys)).run()

@@ -127,6 +127,54 @@ def force_rate(rods: Rods, rod: int, force: Array, arm: float) -> tuple[Array, A
     return force / rods.drag[rod], arm * across / rods.turning_drag[rod]
 
 
+def end_rates(rods: Rods, first: Array, last: Array) -> tuple[Array, Array]:
+    """What forces (F, 3) on the two ends add to dx_c/dt and, before the projection, to dp/dt."""
+    lever = rods.half_length / rods.turning_drag
+    return (first + last) / rods.drag[:, None], lever[:, None] * (last - first)
+
+
+def align_rods(axis: Array, couple: Array, time: float) -> Array:
+    """Directions (F, 3) after `time` under dp/dt = (I - p p^T) c.
+
+    In the plane of p and c the angle between them obeys d(theta)/dt = -|c| sin(theta), hence
+    tan(theta/2) shrinks by e^{-|c| t}.
+    """
+    size = np.linalg.norm(couple, axis=1)[:, None]
+    along = couple / size
+    cosine = (axis * along).sum(axis=1)[:, None]
+    across = axis - cosine * along
+    sine = np.linalg.norm(across, axis=1)[:, None]
+    angle = 2.0 * np.arctan(np.tan(0.5 * np.arctan2(sine, cosine)) * np.exp(-size * time))
+    return np.cos(angle) * along + np.sin(angle) * across / sine
+
+
+def drag_rods(rods: Rods, gradient: Array, pull: Array, couple: Array, time: float) -> Rods:
+    """Rods after `time` in u = G x with these added rates of the ends, by RK4 of small steps."""
+    steps = max(20, math.ceil(400.0 * time))
+    h = time / steps
+
+    def rate(now: Rods) -> tuple[Array, Array]:
+        move, turn = flow_rate(now, gradient)
+        along = (couple * now.axis).sum(axis=1)[:, None]
+        return move + pull, turn + couple - along * now.axis
+
+    for _ in range(steps):
+        slopes = [rate(rods)]
+        for share in (0.5, 0.5, 1.0):
+            move, turn = slopes[-1]
+            there = rods._replace(
+                center=rods.center + share * h * move, axis=rods.axis + share * h * turn
+            )
+            slopes.append(rate(there))
+        move, turn = (
+            (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0 for k1, k2, k3, k4 in zip(*slopes, strict=True)
+        )
+        axis = rods.axis + h * turn
+        axis /= np.linalg.norm(axis, axis=1)[:, None]
+        rods = rods._replace(center=rods.center + h * move, axis=axis)
+    return rods
+
+
 def bead_positions(rods: Rods, rod: int) -> Array:
     """Arc positions of the beads of a rod with a whole number of them; (N,)."""
     count = round(float(rods.beads[rod]))

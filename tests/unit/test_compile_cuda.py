@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
+import ast
+import importlib
+import inspect
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -11,21 +13,39 @@ from typing import Any
 import pytest
 import warp as wp
 
+from warpfiber.laws.contact_compliance import LAWS
 from warpfiber.passes.clock import make_clock
 
-TOOL = Path(__file__).parents[2] / "tools" / "compile_cuda.py"
+TOOLS = Path(__file__).parents[2] / "tools"
+PASSES = Path(__file__).parents[2] / "warpfiber" / "passes"
+# Factories of kernels that only the CPU runs: they hold explicit vectors, or work in sequence.
+CPU_ONLY = {
+    *("make_native_bond_sweep make_native_capsule_pairs make_native_node_sweep".split()),
+    *("make_native_pair_sweep make_near_pairs make_search_kernels make_sort_kernels".split()),
+    *("make_native_prune make_chain_relaxation make_rod_relaxation".split()),
+    *("wait_kernel meet_kernel".split()),
+}
+# What a flag of this name may be, where it is more than whether something is there.
+CHOICES: dict[str, set[Any]] = {
+    "lubrication": {"none", "paper", "shifted"},
+    "closure": {"none", "paper", "consistent"},
+    "pairs": {"none", "closest", "arms"},
+    "law": set(LAWS),
+}
+NO_FLAGS = {"name", "module", "native", "chi", "axis"}
 
 
-def _tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("compile_cuda", TOOL)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["compile_cuda"] = module
-    spec.loader.exec_module(module)
-    return module
+def _module(name: str) -> ModuleType:
+    """A module of tools/, whose files import each other as scripts do."""
+    sys.path.insert(0, str(TOOLS))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(TOOLS))
 
 
-tool = _tool()
+tool = _module("compile_cuda")
+listed = _module("cuda_variants")
 pytestmark = pytest.mark.skipif(
     sys.platform == "darwin", reason="Warp for macOS comes without a CUDA compiler"
 )
@@ -81,44 +101,69 @@ def test_what_is_no_cubin_is_refused() -> None:
 
 def test_a_kernel_without_cubin_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wp, "compile_aot_module", lambda *_, **__: [])
-    monkeypatch.setattr(tool, "kernels", lambda _: [("scale", "plain", scale)])
+    monkeypatch.setattr(tool, "_modules", lambda: [("scale", "float32", scale)])
     costs, failures = tool.compile_all((80, 90), Path("nowhere"))
     assert not costs
-    assert failures == ["scale (float32 plain): 0 files for 2 architectures"]
+    assert failures == ["scale (float32): 0 files for 2 architectures"]
 
 
-def test_every_pass_is_compiled_in_both_precisions() -> None:
-    from warpfiber.passes.cells import ListFeatures, make_cell_kernels
-    from warpfiber.passes.chain_blocks import make_end_kernels
-    from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
-    from warpfiber.passes.contact_verdict import make_contact_verdict
-    from warpfiber.passes.list_bound import make_list_bound
-    from warpfiber.passes.row_count import RowFeatures, make_row_count
-    from warpfiber.passes.rows import make_row_kernels
+def _factories() -> set[str]:
+    """Names of all functions of the passes that make kernels."""
+    found = set()
+    for path in PASSES.glob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            inner = [n for n in ast.walk(node) if isinstance(n, ast.FunctionDef) and n is not node]
+            if any("wp.kernel" in ast.unparse(d) for n in inner for d in n.decorator_list):
+                found.add(node.name)
+    return found
 
-    features = ListFeatures((True, True, True))
-    listed = make_cell_kernels("float32", features) | make_row_kernels("float32", features)
-    contact = {
-        *make_row_count("float32", RowFeatures()),
-        *make_check_sweeps("float32", CheckFeatures()),
-        *make_list_bound("float32"),
-        *make_contact_verdict(),
-        *make_end_kernels("float32"),
-        *("pair_motion fill_rows dual_begin dual_lists dual_step dual_balance fold_sums".split()),
-        *("rod_response rod_apply chain_moves chain_response chain_apply".split()),
-        *("lay_on take_off note_load keep_load set_pace".split()),
+
+def test_every_kernel_that_cuda_runs_is_compiled() -> None:
+    """In both precisions, where it has one."""
+    named: dict[str, set[str]] = {}
+    for precision, (factory, _) in listed.variants():
+        named.setdefault(factory.__name__, set()).add(precision)
+    assert set(named) | CPU_ONLY == _factories()
+    assert not set(named) & CPU_ONLY
+    assert all(names in ({"float32", "float64"}, {""}) for names in named.values())
+    made = [kernel for *_, kernel in listed.kernels()]
+    assert make_clock("float64", True, True) in made
+    assert {kernel.module.name for kernel in made} == {
+        row[2].module.name for row in tool._modules()
     }
-    names = {kernel for kernel, _, _ in tool.kernels("float32")}
-    assert names == {
-        *("clock_step node_sweep pair_sweep measure_fibers measure_pairs measure_terms".split()),
-        *("step_begin chain_step carry_fibers largest_error step_end take_back".split()),
-        *("rod_maps rod_step".split()),
-        *("bond_sweep bond_drift keep_memory carry_memory capsule_pairs".split()),
-        *("measure_bonds".split()),
-        *("move_walls sum_pushes meter_walls steer_wall sum_grips meter_grips".split()),
-        *("bond_losses contact_energy measure_layers drag_moments contact_moments".split()),
-        *listed,
-        *contact,
-    }
-    assert tool.PRECISIONS == ("float32", "float64")
-    assert make_clock("float32", False, False) in [made for *_, made in tool.kernels("float32")]
+
+
+def _flags(factory: Any, arguments: tuple[Any, ...], precise: bool) -> dict[str, Any]:
+    """Value of every flag of one variant; of features every field."""
+    bound = inspect.signature(factory).bind(*(["float32"] if precise else []), *arguments)
+    bound.apply_defaults()
+    flags: dict[str, Any] = {}
+    for name, value in bound.arguments.items():
+        fields = getattr(value, "__dataclass_fields__", {})
+        flags |= {field: getattr(value, field) for field in fields} or {name: value}
+    return {name: value for name, value in flags.items() if name not in NO_FLAGS}
+
+
+def test_every_flag_takes_each_of_its_values() -> None:
+    """A choice each of its words; else there is something in one variant, nothing in another."""
+    seen: dict[tuple[str, str], set[Any]] = {}
+    for precision, (factory, arguments) in listed.variants():
+        for name, value in _flags(factory, arguments, bool(precision)).items():
+            if isinstance(value, tuple):
+                value = any(number is not False for number in value)
+            elif not isinstance(value, str):
+                value = value not in (False, None, -1)
+            seen.setdefault((factory.__name__, name), set()).add(value)
+    assert len(seen) > 60
+    for (factory, name), values in seen.items():
+        wanted = CHOICES[name] if {str} & set(map(type, values)) else {True, False}
+        assert values == wanted, (factory, name, wanted - values)
+
+
+def test_table_is_aligned() -> None:
+    costs = [tool.Cost("scale", "float32", 80, 8, 0, 3000), tool.Cost("k", "a b c", 90, 9, 40, 1)]
+    first, *lines = tool.table(costs)
+    assert {len(line) for line in lines} == {len(first)}
+    assert [line.split()[-3:] for line in lines] == [["8", "0", "3.0"], ["9", "40", "0.0"]]

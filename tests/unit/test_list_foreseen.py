@@ -8,6 +8,9 @@ from tests.meeting_cell import METHODS, meeting_scene
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.simulation import Simulation
 
+# Of all lists; how far fibers bent by others spring without them changes from step to step.
+LEAST = {"rigid_rod": 0.6, "overdamped": 0.4}
+
 
 @pytest.mark.parametrize("method", METHODS)
 def test_most_lists_are_foreseen(method: str) -> None:
@@ -28,6 +31,6 @@ def test_most_lists_are_foreseen(method: str) -> None:
         sim.step()
         assert not sim.method._halted()
     assert len(foreseen) > 10
-    assert sum(foreseen) > 0.6 * len(foreseen)
+    assert sum(foreseen) > LEAST[method] * len(foreseen)
     assert contact.search.list.build_count >= len(foreseen)
     sim.close()

@@ -10,10 +10,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.bonded_crowd import crowd
 from tests.cell import Kind, bent_fiber, isotropic, straight_fiber
+from tests.meeting_cell import METHODS, meeting_scene
 from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
 from warpfiber.methods.pair_search import STEP_PAIR_COST
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, PAIR_COST, RATIO
+from warpfiber.passes.near_pairs import PAIR_COST as NEAR_PAIR_COST
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pieces import piece_counts
 from warpfiber.scene import SceneError
@@ -132,7 +135,7 @@ def test_few_candidates(start: Start) -> None:
     axes = isotropic(rng, count)
     fibers = [straight_fiber(kind, p, edge * rng.random(3)) for p in axes]
     sim = cell(start, (kind,), fibers, box={"size": [edge] * 3})
-    kept, looked = sim.method.list.pair_count, sim.method.list.search_counts()
+    kept, looked = sim.method.list.kept_count, sim.method.list.search_counts()
     assert kept > count
     assert kept <= looked["confirmed"] <= 1.02 * kept
     assert looked["compared"] <= 6 * kept
@@ -179,14 +182,26 @@ def test_skin_follows_the_motion(start: Start) -> None:
     assert tight.method.skin.largest < 4.0
 
 
-def test_pairs_cost_by_method(start: Start) -> None:
-    """An explicit step does less per listed pair than an implicit one, so its skin is thicker."""
+def test_pairs_cost_by_method(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An explicit step does less per listed pair than an implicit one, so its skin is thicker.
+
+    Bonded spheres in vectors look at near pairs in every step, at all others hardly ever.
+    """
     kind = Kind(2, 4.0)
     fibers, _ = random_fibers((kind,), 60, [34.0] * 3, seed=45, spread=5.0)
     explicit = cell(start, (kind,), fibers, flow=SHEAR, box={"size": [34.0] * 3}).method.skin
     assert explicit.pair_cost == PAIR_COST < STEP_PAIR_COST
     implicit = dataclasses.replace(explicit, pair_cost=STEP_PAIR_COST)
     assert implicit.choose(10, 1.0) < explicit.choose(10, 1.0)
+    for method in METHODS:
+        sim = Simulation(meeting_scene(method, 75), workers=1)
+        assert sim.method.skin.pair_cost == STEP_PAIR_COST
+        sim.close()
+    for vectors, cost in ((True, NEAR_PAIR_COST), (False, STEP_PAIR_COST)):
+        monkeypatch.setattr("warpfiber.methods.bonded_spheres.NATIVE", vectors)
+        bed = crowd()
+        assert bed.method.contacts.search.skin.pair_cost == cost  # type: ignore[attr-defined]
+        bed.close()
 
 
 def test_report_of_builds_and_skins(start: Start) -> None:

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from tests.bonded_crowd import crowd
-from tests.physics.test_contact_hand_over import (
-    dragged,
-)
+from tests.physics.test_contact_hand_over import STEP, dragged
 from tests.physics.test_contact_hand_over import test_lines_over_nodes as lines_over_nodes
 from tests.physics.test_contact_hand_over import test_sliding_over_nodes as sliding_over_nodes
 from tests.physics.test_contact_hand_over import test_sticking_over_a_node as sticking_over_a_node
@@ -106,6 +104,13 @@ SCENES: dict[str, dict[str, Any]] = {
         ]
     },
     "smooth": {"contact": {"friction": 0.0, "wall_friction": 0.0, "damping": 0.0}},
+    "planes": {
+        "wall": [
+            {"name": "z-", "velocity": [0.1, -0.05, 0.0]},
+            {"name": "y+", "friction": 0.9},
+            {"name": "z+", "friction": 0.0},
+        ]
+    },
     "open": {
         "box": {"size": [0.06, 0.04, 0.02], "boundary": ["open"] * 3},
         "contact": {"friction": 0.5, "damping": 0.113},
@@ -250,7 +255,7 @@ def test_hand_over(monkeypatch: pytest.MonkeyPatch, velocity: list[float]) -> No
     """A contact that passes nodes, stuck and sliding, at a right angle and along a line."""
     monkeypatch.setattr(native_bonds, "FIBERS_PER_BLOCK", 0)
     assert dragged(90.0, 0.3, velocity, 0.2).method.native is not None  # type: ignore[attr-defined]
-    sliding_over_nodes(velocity)
+    sliding_over_nodes(velocity, STEP)
     sticking_over_a_node(0.98, velocity)
     lines_over_nodes(8.0)
 

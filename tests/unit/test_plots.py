@@ -13,7 +13,7 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.image import imread  # noqa: E402
 
-from warpfiber.output.cell_picture import _closed_lines  # noqa: E402
+from warpfiber.output.cell import closed_lines  # noqa: E402
 from warpfiber.output.folder import ResultFolder  # noqa: E402
 from warpfiber.output.plots import plot_run  # noqa: E402
 from warpfiber.output.scalars import ScalarsWriter  # noqa: E402
@@ -166,7 +166,7 @@ def test_rings_are_drawn_closed() -> None:
     """Of a ring between two open fibers the first node is drawn again at its end."""
     points = np.arange(30.0).reshape(10, 3)
     start = np.array([0, 2, 6, 10], dtype=np.int32)
-    lines, first = _closed_lines(points, start, np.array([False, True, False]))
+    lines, first = closed_lines(points, start, np.array([False, True, False]))
     assert first.tolist() == [0, 2, 7, 11]
     np.testing.assert_array_equal(lines[2:7], points[[2, 3, 4, 5, 2]])
     np.testing.assert_array_equal(lines[7:], points[6:])

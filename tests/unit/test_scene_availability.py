@@ -59,7 +59,6 @@ NOT_YET: list[tuple[dict[str, object], str]] = [
     ({"contact.law": "linear", "contact.stiffness": 1}, "contact.law"),
     ({"contact.friction": 0.3}, "contact.friction"),
     ({"contact.wall_friction": 0.3}, "contact.wall_friction"),
-    ({"wall": [{"name": "z+", "velocity": [1, 0, 0]}]}, "wall.0.kind"),
     ({"stage.0.end_speed": 0.1}, "stage.0.end_speed"),
     ({"stage.0.save": True}, "stage.0.save"),
     ({"stage.0.kind": "settle"}, "stage.0.kind"),

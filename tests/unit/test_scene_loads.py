@@ -101,3 +101,23 @@ def test_methods_without_loads(changes: dict[str, object], key: str) -> None:
     faults = faults_of(changed(changes))
     assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
     assert 'not available in method bead_chain; use method = "overdamped"' in faults[0].remedy
+
+
+RODS: dict[str, Any] = {"numerics__method": "rigid_rod", "numerics__segments": GONE}
+
+
+def test_rods_take_forces_alone() -> None:
+    """On their two nodes; what would hold them is refused."""
+    scene = scene_from_dict(tables({"force": PUSH}, {"node": 0, "force": PUSH}, **RODS))
+    assert [load.node for load in scene.loads] == [-1, 0]
+    for row, key, advice in (
+        ({"hold": "clamp"}, "load.0.hold", "not available in method rigid_rod; use method"),
+        ({"velocity": [1, 0, 0]}, "load.0.velocity", "give force in N"),
+        ({}, "load.0", "does nothing; give force in N"),
+        ({"node": 2, "force": PUSH}, "load.0.node", "2 in fibers.0 per fiber; give 0 ... 1"),
+    ):
+        faults = faults_of(tables(row, **RODS))
+        assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
+        assert advice in faults[0].remedy and "position" not in faults[0].remedy
+    faults = faults_of(tables(**RODS, fibers__0__frozen=True))
+    assert [fault.key for fault in faults] == ["fibers.0.frozen"]

@@ -93,6 +93,25 @@ def test_ring_of_the_paper() -> None:
     np.testing.assert_allclose(edges(closed), 2 * 10.3e-3 * np.sin(np.pi / 26), rtol=1e-5)
 
 
+def test_segments_shorter_than_the_diameter() -> None:
+    """As many as have half a diameter each in bonded spheres, a whole one elsewhere."""
+
+    def texts(segments: int, **keys: Any) -> list[str]:
+        tables = changed({"numerics.segments": segments} | keys)
+        tables["fibers"][0] |= {"diameter": DIAMETER, "centerline_length": 64.7168e-3}
+        tables["fibers"][0].pop("aspect_ratio", None)
+        return [str(fault) for fault in faults_of(tables) if "segments" in fault.key]
+
+    ring = {"numerics.method": "bonded_spheres", "fibers.0.shape": {"kind": "ring"}}
+    assert texts(27, **ring) == texts(53, **ring) == []
+    (text,) = texts(54, **ring)
+    assert "at most 53 = half a diameter each" in text
+    assert texts(26) == []
+    (text,) = texts(27)
+    assert "at most 26 = one per bead" in text
+    assert nodes_of(27, length=64.7168e-3, kind="ring").shape == (27, 3)
+
+
 @pytest.mark.parametrize(
     "shape", [{"kind": "s", "curvature": 72.0}, {"kind": "u", "angle": 90.0}, bent(60, 120, 30)]
 )
@@ -111,7 +130,7 @@ def test_from_end_to_end_along_x(shape: dict[str, Any]) -> None:
         (24, {"kind": "s", "curvature": 300.0}, "overlap"),
         (24, bent(45, 45, 180), "overlap"),
         (24, bent(90, 90, 0) | {"tip": 0.01}, "middle \\+ 2 tip"),
-        (40, {"kind": "straight"}, "shorter than the diameter"),
+        (56, {"kind": "straight"}, "shorter than half the diameter"),
         (8, {"kind": "points", "file": "missing.csv"}, "cannot be read"),
     ],
 )

@@ -179,6 +179,37 @@ def test_wrong_input_is_refused_and_changes_nothing(tmp_path: Path) -> None:
         )
 
 
+def test_rings_name_their_first_node_again(tmp_path: Path) -> None:
+    """As cells only: nodes, frames and a record that is reopened count every node once."""
+    path = tmp_path / "run.vtkhdf"
+    writer = TrajectoryWriter(
+        path,
+        fiber_node_start=START,
+        fiber_group=GROUP,
+        scene_json="{}",
+        attrs={},
+        closed_groups=[True, False],
+    )
+    points = np.random.default_rng(1).normal(size=(10, 3)).astype(np.float32)
+    writer.append(0, 0.0, 0.0, points)
+    writer.close()
+    with h5py.File(path, "r") as file:
+        lines = file["VTKHDF/Lines"]
+        assert lines["Offsets"][()].tolist() == [0, 4, 9, 11]
+        assert lines["Connectivity"][()].tolist() == [0, 1, 2, 0, 3, 4, 5, 6, 7, 8, 9]
+        assert lines["NumberOfConnectivityIds"][()].tolist() == [11]
+        assert file["VTKHDF/Points"].shape == (10, 3)
+    writer = TrajectoryWriter.reopen(path, 0)
+    assert writer.fiber_node_start.tolist() == START.tolist()
+    writer.append(1, 1.0, 1.0, points + 1.0)
+    writer.close()
+    with TrajectoryReader(path) as reader:
+        assert reader.frame_count == 2 and reader.whole
+        assert reader.fiber_node_start.tolist() == START.tolist()
+        assert reader.fiber_closed.tolist() == [True, False, False]
+        assert np.array_equal(reader.node_pos(1), points + 1.0)
+
+
 @pytest.mark.parametrize("last_step, left", [(25, 3), (20, 3), (0, 1), (-1, 0), (999, 6)])
 def test_resume_equals_uninterrupted(tmp_path: Path, last_step: int, left: int) -> None:
     _write(tmp_path / "a.vtkhdf", 6)

@@ -37,7 +37,12 @@ def _lattice(frame: int, edge: float = EDGE, sheared: bool = True) -> np.ndarray
 
 
 def _record(
-    folder: Path, boxed: bool = True, sheared: bool = True, edge: float = EDGE, **box: Any
+    folder: Path,
+    boxed: bool = True,
+    sheared: bool = True,
+    edge: float = EDGE,
+    closed_groups: tuple[bool, ...] = (),
+    **box: Any,
 ) -> Path:
     scene: dict[str, Any] = {"fibers": [{"diameter": 2 * r * edge / EDGE} for r in RADIUS]}
     if boxed:
@@ -49,6 +54,7 @@ def _record(
         fiber_group=GROUP,
         scene_json=json.dumps(scene),
         attrs={"version": "0.1.0", "hash": "ab12"},
+        closed_groups=closed_groups,
     )
     for k in range(FRAMES):
         lattice = _lattice(k, edge, sheared) if boxed else None
@@ -101,6 +107,30 @@ def test_every_sample_is_consistent_and_valid(tmp_path: Path, wrap: Any, smooth:
     if smooth:
         assert curves.GetBasisAttr().Get() == "catmullRom"
         assert curves.GetWrapAttr().Get() == "pinned"
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("wrap", ["none", "fiber", "split"])
+def test_rings_are_closed(tmp_path: Path, wrap: Any, smooth: bool) -> None:
+    """Periodic curves with every node once; cut ones have the length of the closed fibers."""
+    folder = _record(tmp_path / "run", closed_groups=(False, True))
+    stage = Usd.Stage.Open(str(export_usd(folder, wrap=wrap, smooth=smooth)))
+    _check_samples(stage, FRAMES)
+    assert _findings(stage) == []
+    open_ends = "pinned" if smooth else "nonperiodic"
+    wraps = [_curves(stage, k).GetWrapAttr().Get() for k in range(2)]
+    assert wraps == [open_ends, open_ends if wrap == "split" else "periodic"]
+    points = np.array(_curves(stage, 1).GetPointsAttr().Get(0)).astype(float) * 1e-6
+    counts = np.array(_curves(stage, 1).GetCurveVertexCountsAttr().Get(0))
+    if wrap != "split":
+        assert counts.tolist() == [NODES] * 10
+        return
+    nodes = _positions(0).reshape(COUNT, NODES, 3)[30:]
+    edges = np.roll(nodes, -1, axis=1) - nodes
+    joined = np.ones(len(points) - 1, bool)
+    joined[np.cumsum(counts)[:-1] - 1] = False
+    total = np.linalg.norm(np.diff(points, axis=0), axis=1)[joined].sum()
+    assert total == pytest.approx(np.linalg.norm(edges, axis=2).sum(), rel=1e-6)
 
 
 def test_stage_says_what_it_is(tmp_path: Path) -> None:

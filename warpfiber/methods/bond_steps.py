@@ -18,6 +18,7 @@ from warpfiber.laws.hertz import DASHPOT
 from warpfiber.methods.bond_constants import bond_constants
 from warpfiber.scene import FiberGroup, Scene
 from warpfiber.scene.containers import container
+from warpfiber.scene.planes import rubs
 
 Matrix = np.ndarray
 OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
@@ -70,7 +71,7 @@ def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
     walled = scene.box is not None and "wall" in scene.box.boundary
     if walled or container(scene) is not None:
         stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)
-        steps["walls"] = touch_step(scene, group, end, stiffness, contact.wall_friction)
+        steps["walls"] = touch_step(scene, group, end, stiffness, float(rubs(scene)))
     if contact.law != "none":
         # against a fiber of its own kind half the modulus; what it touches moves against it
         stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)

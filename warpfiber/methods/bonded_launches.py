@@ -113,7 +113,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
         spheres.press.velocity,
         spheres.press.fiber_push,
         p.real(spheres.scene.contact.damping),
-        p.real(spheres.scene.contact.wall_friction),
+        spheres.wall_face,
         spheres.stage,
         spheres.groups,
         model.fiber_node_start,

@@ -24,6 +24,7 @@ from warpfiber.passes.contact_energy import (
     measure_contact_energy,
 )
 from warpfiber.passes.executor import Launch
+from warpfiber.scene.planes import slides
 
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
@@ -55,7 +56,7 @@ class Energies:
             spheres.press.place,
             spheres.press.velocity,
             p.real(contact.damping),
-            p.real(contact.wall_friction),
+            spheres.wall_face,
             spheres.stage,
             spheres.groups,
             model.fiber_node_start,
@@ -179,7 +180,10 @@ class Energies:
             "dissipated_friction": rubs,
         }
         unit = model.units.energy
-        return {name: value * unit for name, value in row.items() if present.get(name, True)}
+        row = {name: value * unit for name, value in row.items() if present.get(name, True)}
+        if slides(spheres.scene):
+            row["wall_work"] = spheres.press.measure().get("wall_work", 0.0) + lost["drive"] * unit
+        return row
 
     def saved(self) -> dict[str, np.ndarray]:
         """Sums since the start."""

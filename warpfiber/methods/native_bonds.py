@@ -72,7 +72,7 @@ class NativeBonds:
             spheres.press.velocity,
             spheres.press.fiber_push,
             p.real(spheres.scene.contact.damping),
-            p.real(spheres.scene.contact.wall_friction),
+            spheres.wall_face,
             spheres.wall_memory,
             spheres.wall_depth,
             spheres.stage,

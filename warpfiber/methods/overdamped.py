@@ -63,7 +63,9 @@ class Overdamped(Implicit):
             response = ChainResponse(
                 model, self.rows, self.row_stride, self.tension, fiber_pace=self.fiber_pace
             )
-            self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
+            # others hold bent what is packed; straight fibers would carry the load to no use
+            if model.starts_bent:
+                self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
             self._make_contact(response, self.load)
         self.paced = self.contact is not None and self.contact.packed
 

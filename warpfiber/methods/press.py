@@ -206,7 +206,8 @@ class Press:
             return 0
         room = self._room(stage)
         if room < travel:
-            remedy = "has come as far as it can without an end of the stage; end it earlier"
+            unmet = self.unmet(stage) or "end_time"
+            remedy = f"has come as far as it can; not met: {unmet}; end it earlier"
             where = f"stage '{stage.name}': wall"
             raise SceneError([Fault(self.scene.path, where, stage.wall, remedy)])
         return min([*counts, math.floor(room / travel)])

@@ -4,7 +4,7 @@ A step (`implicit`): maps (`passes.rigid_rods`: one matrix exponential per group
 contact by `rod_response`. Without contact, orientation and position are exact in the strain of a
 step of any size, so a step is as long as the times between outputs allow.
 Source: Jeffery orbit of a rigid line of N touching beads; a force moves its center by drag
-    6 pi eta a N alone.
+    6 pi eta a N alone, forces on its ends ([[load]]) turn it (`passes.rigid_rods`).
 Symbols: lambda_J = Q / (Q + 4 w) with Q = N (N^2 - 1) and w beads that carry torque (N, or N - 1
     with plain weights); mu = (1 - lambda_J)/2 = 2 w / (Q + 4 w).
 Limits: contact is first order in dt. Nothing bends: see `scene.rigidity` for what that leaves out.
@@ -18,8 +18,10 @@ import numpy as np
 import warp as wp
 
 from warpfiber.methods.implicit import Implicit, Launches
+from warpfiber.methods.loads import node_loads
 from warpfiber.model import Model, State
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step, rod_map
 from warpfiber.passes.rod_response import RodResponse
 from warpfiber.scene import Fault, Scene, SceneError
@@ -37,7 +39,10 @@ class RigidRod(Implicit):
         settling = np.asarray([row["body_force"] / row["drag"] for row in model.group_rows])
         self.shape_mu = wp.array(mu, dtype=wp.float64, device=model.device)
         self.shape_settling = wp.array(settling, dtype=wp.vec3d, device=model.device)
-        shape = rod_map(model.precision.name)
+        _, load = node_loads(scene, model)
+        p = model.precision
+        self.node_load = wp.array(load.astype(p.numpy), dtype=p.vec3, device=model.device)
+        shape = rod_map(p.name)
         self.maps = wp.zeros(len(mu), dtype=shape, device=model.device)
         self._make_contact(RodResponse(model))
 
@@ -72,13 +77,17 @@ class RigidRod(Implicit):
             model.fiber_group,
             model.groups,
             model.fiber_group,
+            self.step_size,
+            self.node_load,
             state.node_pos,
             state.node_velocity,
             self.node_back,
             self.velocity_back,
             state.status,
         ]
-        kernel = make_rod_step(p.name, self.module)
+        loaded = self.node_load.shape[0] > 0
+        module = kernel_module("loaded_rods", p.name) if loaded else self.module
+        kernel = make_rod_step(p.name, loaded, module)
         return Launch("fibers", kernel, model.fiber_count, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------

@@ -132,6 +132,15 @@ class Cell:
         return points @ self.lattice.T, count, owner[s][new].astype(np.int32)
 
 
+def closed_lines(
+    points: Floats, start: NDArray[np.int32], closed: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Points and first points of the same fibers, that of `closed` ones (F,) at their end too."""
+    first, end = start[:-1][closed], start[1:][closed]
+    shift = np.concatenate([[0], np.cumsum(closed)]).astype(np.int32)
+    return np.insert(points, end, points[first], axis=0), start + shift
+
+
 def group_radius(scene: Mapping[str, Any], group_count: int) -> Floats:
     """Fiber radius of each group (G,), m; raises RecordError if the scene lacks it."""
     found = []

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpfiber.output.cell import Cell, group_radius
+from warpfiber.output.cell import Cell, closed_lines, group_radius
 from warpfiber.output.record_error import record_errors
 from warpfiber.output.trajectory import TrajectoryReader
 
@@ -83,12 +83,7 @@ def draw_cell(reader: TrajectoryReader, path: Path, frame: int = -1) -> None:
     axes.set_aspect("equal")
     if cell is not None:
         _draw_edges(axes, cell, camera)
-    rings = [
-        number
-        for number, row in enumerate(reader.scene.get("fibers") or [])
-        if (row.get("shape") or {}).get("kind") == "ring"
-    ]
-    lines = _closed_lines(points, start, np.isin(group, rings))
+    lines = closed_lines(points, start, reader.fiber_closed)
     _draw_tubes(axes, camera, *lines, radius, axis)
     flat = camera.project(outline)[0]
     _frame_view(axes, flat)
@@ -113,15 +108,6 @@ def _draw_edges(axes: Axes, cell: Cell, camera: _Camera) -> None:
     axes.add_collection(LineCollection(list(flat[behind]), colors="#c3c8cf", linewidths=0.9))
     front = LineCollection(list(flat[~behind]), colors=_EDGE, linewidths=1.0, zorder=5, alpha=0.9)
     axes.add_collection(front)
-
-
-def _closed_lines(
-    points: Floats, start: NDArray[np.int32], closed: NDArray[np.bool_]
-) -> tuple[Floats, NDArray[np.int32]]:
-    """Points and first points of the same fibers, that of `closed` ones (F,) at their end too."""
-    first, end = start[:-1][closed], start[1:][closed]
-    shift = np.concatenate([[0], np.cumsum(closed)]).astype(np.int32)
-    return np.insert(points, end, points[first], axis=0), start + shift
 
 
 def _draw_tubes(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpfiber.output.axes_style import GRAY, INK
-from warpfiber.output.cell import Cell, group_radius
+from warpfiber.output.cell import Cell, closed_lines, group_radius
 from warpfiber.output.cell_picture import direction_colors
 from warpfiber.output.record_error import record_errors
 from warpfiber.output.trajectory import TrajectoryReader
@@ -138,7 +138,8 @@ def _segments(
 ) -> tuple[Floats, Floats, NDArray[np.int32], Floats]:
     """Begin and end (S, 3) of the segments inside the box, their fibers and radii."""
     points = reader.node_pos(frame).astype(np.float64)
-    pieces, count, owner = cell.split_fibers(points, reader.fiber_node_start)
+    lines = closed_lines(points, reader.fiber_node_start, reader.fiber_closed)
+    pieces, count, owner = cell.split_fibers(*lines)
     group = reader.fiber_group
     of_piece = np.repeat(owner, count)
     piece = np.repeat(np.arange(len(count)), count)

@@ -4,8 +4,9 @@ One cell (polyline) per fiber, topology written once, positions appended frame b
 ParaView open it directly; `/warpfiber` beside `/VTKHDF` holds what VTK has no place for.
 
 Symbols: N nodes, F fibers, K frames. Positions in m, unwrapped, float32; times in s, float64.
-Limits: open chains only (a ring would repeat its first node id). The file keeps the default
-(oldest) HDF5 layout: newer ones do not open after the writer was killed, nor does VTK read all.
+A ring names its first node once more at the end of its cell; positions hold every node once.
+Limits: the file keeps the default (oldest) HDF5 layout: newer ones do not open after the writer was
+killed, nor does VTK read all.
 Per frame: data, then offsets, then `NSteps`, then flush, so a killed run loses at most one frame.
 """
 
@@ -40,12 +41,14 @@ class TrajectoryWriter:
         fiber_group: ArrayLike,
         scene_json: str,
         attrs: Mapping[str, Any],
+        closed_groups: Sequence[bool] = (),
         node_fields: Sequence[str] = (),
         layer_columns: Sequence[str] = (),
     ) -> None:
         """Start a record of F fibers: `fiber_node_start` (F+1), `fiber_group` (F).
 
         `attrs` (hash, version, device, precision, seed ...) become attributes of `/warpfiber`;
+        `closed_groups` says of each group whether its fibers are rings (default: none is);
         `node_fields` names what every `append` brings per node, `layer_columns` the columns of its
         value `layers` (layers, columns). Raises RecordError if refused.
         """
@@ -55,10 +58,12 @@ class TrajectoryWriter:
         group = np.asarray(fiber_group, dtype=np.int32)
         if start.shape != (len(group) + 1,) or start[0] != 0:
             raise ValueError("fiber_node_start must be (F+1,) from 0, fiber_group (F,)")
+        closed = np.zeros(max(len(closed_groups), int(group.max(initial=-1)) + 1), bool)
+        closed[: len(closed_groups)] = closed_groups
         self.path = Path(path)
         with record_errors(self.path, "write"):
             file = h5py.File(self.path, "w")
-            _write_topology(file, start, group)
+            _write_topology(file, start, group, closed[group])
             own = file.create_group("warpfiber")
             own.attrs["scene"] = scene_json
             own.attrs["node_fields"] = json.dumps(list(node_fields))
@@ -129,7 +134,7 @@ class TrajectoryWriter:
 
     def _attach(self, file: h5py.File) -> None:
         self._file = file
-        self.fiber_node_start = file["VTKHDF/Lines/Offsets"][()]
+        self.fiber_node_start, _ = _read_topology(file)
         self.node_count = int(file["VTKHDF/NumberOfPoints"][0])
         self.fiber_count = len(self.fiber_node_start) - 1
         self.node_fields = tuple(json.loads(file["warpfiber"].attrs["node_fields"]))
@@ -201,7 +206,9 @@ class TrajectoryReader:
             self.frame_count: int = count
             self.whole: bool = all(found == count for found in counts.values())
             self.node_count: int = int(file["VTKHDF/NumberOfPoints"][0])
-            self.fiber_node_start: NDArray[np.int32] = file["VTKHDF/Lines/Offsets"][()].astype("i4")
+            start, closed = _read_topology(file)
+            self.fiber_node_start: NDArray[np.int32] = start.astype("i4")
+            self.fiber_closed: NDArray[np.bool_] = closed
             self.fiber_group: NDArray[np.int32] = file["VTKHDF/CellData/fiber_group"][()]
             self.fiber_count: int = len(self.fiber_group)
             self.time: NDArray[np.float64] = file["VTKHDF/Steps/Values"][:count]
@@ -272,9 +279,16 @@ def fiber_axes(node_pos: ArrayLike, fiber_node_start: ArrayLike) -> NDArray[np.f
     return axis
 
 
-def _write_topology(file: h5py.File, start: NDArray[np.int64], group: NDArray[np.int32]) -> None:
+def _write_topology(
+    file: h5py.File,
+    start: NDArray[np.int64],
+    group: NDArray[np.int32],
+    closed: NDArray[np.bool_],
+) -> None:
     """Write all that does not change: types, connectivity, empty datasets of the frames."""
     nodes, fibers = int(start[-1]), len(group)
+    ids = np.insert(np.arange(nodes), start[1:][closed], start[:-1][closed])
+    offsets = start + np.concatenate([[0], np.cumsum(closed)])
     root = file.create_group("VTKHDF")
     root.attrs["Version"] = np.array([2, 3], np.int64)
     root.attrs.create("Type", np.bytes_("PolyData"))
@@ -283,9 +297,9 @@ def _write_topology(file: h5py.File, start: NDArray[np.int64], group: NDArray[np
     for name in _CELL_TYPES:
         lines = name == "Lines"
         _static(root, f"{name}/NumberOfCells", np.array([fibers if lines else 0]))
-        _static(root, f"{name}/NumberOfConnectivityIds", np.array([nodes if lines else 0]))
-        _static(root, f"{name}/Offsets", start if lines else np.zeros(1, np.int64))
-        _static(root, f"{name}/Connectivity", np.arange(nodes if lines else 0))
+        _static(root, f"{name}/NumberOfConnectivityIds", np.array([len(ids) if lines else 0]))
+        _static(root, f"{name}/Offsets", offsets if lines else np.zeros(1, np.int64))
+        _static(root, f"{name}/Connectivity", ids if lines else np.arange(0))
     root.create_group("FieldData")
     root.create_group("PointData")
     _static(root, "CellData/fiber_group", group)
@@ -300,6 +314,14 @@ def _write_topology(file: h5py.File, start: NDArray[np.int64], group: NDArray[np
         _empty(steps, name, np.int64, (len(_CELL_TYPES),))
     for name in ("fiber_group", "fiber_axis"):
         _empty(steps, f"CellDataOffsets/{name}", np.int64, ())
+
+
+def _read_topology(file: h5py.File) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """First nodes of the fibers (F+1,), and which of them are rings (F,)."""
+    offsets, ids = file["VTKHDF/Lines/Offsets"][()], file["VTKHDF/Lines/Connectivity"][()]
+    closed = (ids[offsets[1:] - 1] == ids[offsets[:-1]]) & (np.diff(offsets) > 1)
+    start: NDArray[np.int64] = offsets - np.concatenate([[0], np.cumsum(closed)])
+    return start, closed
 
 
 def _static(group: h5py.Group, name: str, data: NDArray[Any]) -> None:

@@ -1,10 +1,10 @@
 """USD export: the record of a run as one animated stage, `usd/run.usdc`.
 
-One linear `BasisCurves` per fiber group at `/World/Fibers/group_<k>`, exact through the nodes, with
-width = diameter and, as color, (p_x^2, p_y^2, p_z^2) of the unit fiber axis p; the box edges at
-`/World/Box`. Frames map to time codes 0 ... K-1 (playback is not physical time; the physical times
-are in `customLayerData`). Lengths are in mm or um with an honest `metersPerUnit`, because some
-renderers break on scenes of size 1e-3.
+One linear `BasisCurves` per fiber group at `/World/Fibers/group_<k>`, exact through the nodes (of
+rings: periodic; cut at the box: open pieces), with width = diameter and, as color, (p_x^2, p_y^2,
+p_z^2) of the unit fiber axis p; the box edges at `/World/Box`. Frames map to time codes 0 ... K-1
+(playback is not physical time; the physical times are in `customLayerData`). Lengths are in mm or
+um with an honest `metersPerUnit`, because some renderers break on scenes of size 1e-3.
 
 Limits: `split` needs a box; unbounded scenes are written as recorded.
 """
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from warpfiber.output.cell import Cell, group_radius
+from warpfiber.output.cell import Cell, closed_lines, group_radius
 from warpfiber.output.record_error import RecordError, record_errors
 from warpfiber.output.trajectory import TrajectoryReader
 
@@ -105,7 +105,9 @@ def _write_stage(
 
     group_count = int(reader.fiber_group.max(initial=-1)) + 1
     radius = group_radius(reader.scene, group_count) / unit
-    groups = [_Group(stage, k, radius[k], smooth, material) for k in range(group_count)]
+    cut = wrap == "split" and cells[0] is not None
+    rings = [not cut and bool(closed.any()) for closed in _by_group(reader, group_count)]
+    groups = [_Group(stage, k, radius[k], smooth, rings[k], material) for k in range(group_count)]
     for code, (frame, cell) in enumerate(zip(frames, cells, strict=True)):
         points, counts, owner = _curves(reader, frame, cell, wrap)
         if color == "orientation":
@@ -122,16 +124,27 @@ def _write_stage(
     stage.Save()
 
 
+def _by_group(reader: TrajectoryReader, group_count: int) -> list[NDArray[np.bool_]]:
+    """Of every group, which of its fibers are rings: all or none."""
+    return [reader.fiber_closed[reader.fiber_group == k] for k in range(group_count)]
+
+
 class _Group:
     """The curves of one fiber group; authors a time sample only where something changes."""
 
     def __init__(
-        self, stage: Usd.Stage, index: int, radius: float, smooth: bool, material: Any
+        self,
+        stage: Usd.Stage,
+        index: int,
+        radius: float,
+        smooth: bool,
+        closed: bool,
+        material: Any,
     ) -> None:
         from pxr import UsdGeom, Vt
 
         curves = UsdGeom.BasisCurves.Define(stage, f"/World/Fibers/group_{index}")
-        _set_curve_type(curves, smooth)
+        _set_curve_type(curves, smooth, closed)
         curves.CreateWidthsAttr(Vt.FloatArray([2 * radius]))
         curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
         _bind(curves, material)
@@ -180,7 +193,7 @@ def _curves(
     start = reader.fiber_node_start
     points = reader.node_pos(frame).astype(np.float64)
     if cell is not None and wrap == "split":
-        return cell.split_fibers(points, start)
+        return cell.split_fibers(*closed_lines(points, start, reader.fiber_closed))
     if cell is not None and wrap == "fiber":
         points = cell.wrap_fibers(points, start)
     return points, np.diff(start).astype(np.int32), np.arange(len(start) - 1, dtype=np.int32)
@@ -238,17 +251,18 @@ def _bind(curves: UsdGeom.BasisCurves, material: Any) -> None:
     UsdShade.MaterialBindingAPI.Apply(curves.GetPrim()).Bind(material)
 
 
-def _set_curve_type(curves: UsdGeom.BasisCurves, smooth: bool) -> None:
+def _set_curve_type(curves: UsdGeom.BasisCurves, smooth: bool, closed: bool = False) -> None:
     """Linear, or a cubic that passes through the nodes (a B-spline would not)."""
     from pxr import UsdGeom
+
+    open_ends = UsdGeom.Tokens.pinned if smooth else UsdGeom.Tokens.nonperiodic
+    curves.CreateWrapAttr(UsdGeom.Tokens.periodic if closed else open_ends)
 
     if smooth:
         curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
         curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
-        curves.CreateWrapAttr(UsdGeom.Tokens.pinned)
     else:
         curves.CreateTypeAttr(UsdGeom.Tokens.linear)
-        curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
 
 
 def _write_box(

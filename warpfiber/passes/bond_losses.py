@@ -3,7 +3,7 @@
 One thread per fiber adds to its sums. The loads of a step are found with the speeds amid it,
 v - a dt / 2; around them they do the work F . v dt (see `contact_energy`).
 Source: laws `bond`, `hertz` and `friction`. Friction on walls: work put in against it; what its
-    memories store is told by `bond_energy`.
+    memories store is told by `bond_energy`. Drive: what walls that move in their planes put in.
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import SETTLING, BondFeatures
 from warpfiber.passes.node_walls import CONTAINER, SIDES, make_concave
 
-LOST = ("bonds", "settling", "walls", "wall friction")  # columns
+LOST = ("bonds", "settling", "walls", "wall friction", "drive")  # columns
 
 
 @cache
@@ -67,7 +67,7 @@ def make_bond_losses(name: str, features: BondFeatures):
     def wall_loss(
         g: BondGroup,
         beta: real,
-        friction: real,
+        face: vec4,
         mass: real,
         amid: Node,
         now: Node,
@@ -81,22 +81,23 @@ def make_bond_losses(name: str, features: BondFeatures):
         """Of the dashpot, and what friction takes; n points into the box."""
         depth = g.radius - gap
         if depth <= zero:
-            return zero, zero
+            return zero, zero, zero
         k = plane_stiffness(g.wall_modulus, curvature_radius, depth)
         size = plane_push(k, beta, mass, depth, wp.dot(amid.v, n) - approach)
         lost = (spring_part * k * depth - size) * (wp.dot(now.v, n) - approach)
         rubbed = zero
+        driven = zero
         if wp.static(has_friction):
             arm = -gap * n
-            slide = amid.v + wp.cross(amid.w, arm)
+            velocity = vec3(face[1], face[2], face[3])
+            slide = amid.v + wp.cross(amid.w, arm) - velocity
             slide -= wp.dot(slide, n) * n
             stiffness = real(4.0) * g.compliance / g.shear_compliance * k
             resistance = dashpot * beta * wp.sqrt(stiffness * mass)
-            force, _h = friction_force(
-                memories[slot], stiffness, resistance, slide, friction * size
-            )
-            rubbed = -wp.dot(force, now.v + wp.cross(now.w, arm))
-        return lost, rubbed
+            force, _h = friction_force(memories[slot], stiffness, resistance, slide, face[0] * size)
+            driven = wp.dot(force, velocity)
+            rubbed = driven - wp.dot(force, now.v + wp.cross(now.w, arm))
+        return lost, rubbed, driven
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def bond_losses(
@@ -106,7 +107,7 @@ def make_bond_losses(name: str, features: BondFeatures):
         wall_place: wp.array(dtype=wp.vec3d),
         wall_velocity: wp.array(dtype=wp.vec2d),
         wall_damping: real,
-        wall_friction: real,
+        wall_face: wp.array(dtype=vec4),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -132,6 +133,7 @@ def make_bond_losses(name: str, features: BondFeatures):
         in_settling = wp.float64(0.0)
         at_walls = wp.float64(0.0)
         rubbed = wp.float64(0.0)
+        driven = wp.float64(0.0)
         for i in range(first, last + 1):
             mass = g.mass
             inertia = g.inertia
@@ -172,10 +174,10 @@ def make_bond_losses(name: str, features: BondFeatures):
                             if axis == press:
                                 approach = n[axis] * real(wall_velocity[0][side_of])
                             slot = wp.static(SIDES) * i + 2 * axis + side_of
-                            loss, slid = wall_loss(
+                            loss, slid, drive = wall_loss(
                                 g,
                                 wall_damping,
-                                wall_friction,
+                                wall_face[2 * axis + side_of],
                                 mass,
                                 amid,
                                 now,
@@ -188,12 +190,13 @@ def make_bond_losses(name: str, features: BondFeatures):
                             )
                             at_walls += wp.float64(loss)
                             rubbed += wp.float64(slid)
+                            driven += wp.float64(drive)
             if wp.static(has_container):
                 side = container_gap(now.x, wall_place[2])
-                loss, slid = wall_loss(
+                loss, slid, _drive = wall_loss(
                     g,
                     wall_damping,
-                    wall_friction,
+                    wall_face[wp.static(CONTAINER)],
                     mass,
                     amid,
                     now,
@@ -210,5 +213,6 @@ def make_bond_losses(name: str, features: BondFeatures):
         lost[fiber, 1] = lost[fiber, 1] + dt * in_settling
         lost[fiber, 2] = lost[fiber, 2] + dt * at_walls
         lost[fiber, 3] = lost[fiber, 3] + dt * rubbed
+        lost[fiber, 4] = lost[fiber, 4] + dt * driven
 
     return bond_losses

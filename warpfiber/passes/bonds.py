@@ -109,7 +109,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         wall_velocity: wp.array(dtype=wp.vec2d),
         fiber_push: wp.array(dtype=wp.vec2d),
         wall_damping: real,
-        wall_friction: real,
+        wall_face: wp.array(dtype=vec4),
         stage: wp.array(dtype=real),
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
@@ -246,7 +246,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 push, couple, pushes = wall_loads(
                     g,
                     wall_damping,
-                    wall_friction,
+                    wall_face,
                     step,
                     mass,
                     i,

@@ -140,7 +140,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
         wall_velocity: wp.array(dtype=wp.vec2d),
         fiber_push: wp.array(dtype=wp.vec2d),
         wall_damping: real,
-        wall_friction: real,
+        wall_face: wp.array(dtype=vec4),
         wall_memory: wp.array(dtype=vec3),
         wall_depth: wp.array(dtype=real),
         stage: wp.array(dtype=real),
@@ -212,7 +212,7 @@ def make_native_bond_sweep(name: str, features: BondFeatures):
                             push, couple, pushes = wall_loads(
                                 g,
                                 wall_damping,
-                                wall_friction,
+                                wall_face,
                                 step,
                                 mass,
                                 i,

@@ -3,7 +3,8 @@
 Source: laws `hertz` and `friction`; walls are rigid. Those of axis `press` move along their normal,
     and what they push with is told. A container is a cylinder along z around the fibers: inside it
     R* = 1 / (1 / a - 1 / R).
-Symbols: places of walls: lower and upper corner, and of a container (x, y of its axis, R).
+Symbols: places of walls: lower and upper corner, and of a container (x, y of its axis, R). Faces of
+    walls: friction, and the velocity in their planes.
 """
 
 from functools import cache
@@ -56,7 +57,7 @@ def make_node_walls(
     Third, the pushes of the two walls of axis `press` (-1: none).
     """
     p = precision(name)
-    real, vec3 = p.real, p.vec3
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     Node = node_struct(name)
     plane_stiffness, plane_push, _ = make_hertz(name)
@@ -70,7 +71,7 @@ def make_node_walls(
     def one_wall(
         g: BondGroup,
         beta: real,
-        friction: real,
+        face: vec4,
         dt: real,
         mass: real,
         node: Node,
@@ -99,14 +100,14 @@ def make_node_walls(
         size = plane_push(k, beta, mass, depth, speed)
         if wp.static(has_friction):
             arm = -gap * n
-            slide = node.v + wp.cross(node.w, arm)
+            slide = node.v + wp.cross(node.w, arm) - vec3(face[1], face[2], face[3])
             slide -= wp.dot(slide, n) * n
             stiffness = real(4.0) * g.compliance / g.shear_compliance * k
             turn = half * dt * wp.dot(node.w, n)
             memory = carried_memory(memories[slot], depths[slot], depth, n, turn)
             resistance = dashpot * beta * wp.sqrt(stiffness * mass)
             force, memory = friction_force(
-                memory + dt * slide, stiffness, resistance, slide, friction * size
+                memory + dt * slide, stiffness, resistance, slide, face[0] * size
             )
             memories[slot] = memory
             depths[slot] = depth
@@ -117,7 +118,7 @@ def make_node_walls(
     def wall_loads(
         g: BondGroup,
         beta: real,
-        friction: real,
+        faces: wp.array(dtype=vec4),
         dt: real,
         mass: real,
         i: wp.int32,
@@ -149,7 +150,7 @@ def make_node_walls(
                     push, couple, size = one_wall(
                         g,
                         beta,
-                        friction,
+                        faces[2 * axis + side],
                         dt,
                         mass,
                         node,
@@ -170,7 +171,7 @@ def make_node_walls(
             push, couple, _size = one_wall(
                 g,
                 beta,
-                friction,
+                faces[wp.static(CONTAINER)],
                 dt,
                 mass,
                 node,

@@ -38,6 +38,34 @@ class NodeFeatures:
 
 
 @cache
+def make_skin_limit(name: str):
+    """`skin_limit(F, skin, h_list)` -> largest motion beside the flow that a list allows."""
+    p = precision(name)
+    real, mat33 = p.real, p.mat33
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+
+    @wp.func
+    def skin_limit(affine: mat33, skin: real, list_reach: real) -> real:
+        """Largest |u| (motion beside the flow) with which no unlisted pair can be within reach.
+
+        2 max|u| + (1 - sigma_min(F)) h_list <= skin; 1 - sigma_min is at most the largest row sum
+        of |sym(F - I)|.
+        """
+        stretch = zero
+        for row in range(3):
+            norm = zero
+            for col in range(3):
+                identity = zero
+                if row == col:
+                    identity = one
+                norm += wp.abs(half * (affine[row, col] + affine[col, row]) - identity)
+            stretch = wp.max(stretch, norm)
+        return half * (skin - stretch * list_reach)
+
+    return skin_limit
+
+
+@cache
 def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
     """Kernel `node_sweep` in the given precision with the given features."""
     p = precision(name)
@@ -49,6 +77,7 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
     stretching_force = make_stretching(name)
     _, bending_forces = make_bending(name)
     wall_push = make_wall(name)
+    skin_limit = make_skin_limit(name)
     (
         split_force,
         translation_factor,
@@ -116,24 +145,6 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
                 else:
                     second -= pair_closest[k][1] * force
         return total, second
-
-    @wp.func
-    def skin_limit(affine: mat33, skin: real, list_reach: real) -> real:
-        """Largest |u| (motion beside the flow) with which no unlisted pair can be within reach.
-
-        2 max|u| + (1 - sigma_min(F)) h_list <= skin; 1 - sigma_min is at most the largest row sum
-        of |sym(F - I)|.
-        """
-        stretch = zero
-        for row in range(3):
-            norm = zero
-            for col in range(3):
-                identity = zero
-                if row == col:
-                    identity = one
-                norm += wp.abs(half * (affine[row, col] + affine[col, row]) - identity)
-            stretch = wp.max(stretch, norm)
-        return half * (skin - stretch * list_reach)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def node_sweep(

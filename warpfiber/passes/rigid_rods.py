@@ -3,14 +3,17 @@
 Source: Jeffery 1922, and the balance of bead drag 6 pi eta a and bead torque 8 pi eta a^3 along a
     rigid line of N touching beads. In u = G (x - x0), with p the direction and c the center:
         p -> e^B p / |e^B p|,      B = phi (W + lambda_J S) = phi [(1 - mu) G - mu G^T]
-        c - x0 -> e^(phi G) (c - x0) + dt psi v_s,   psi = integral of e^(phi G t), t = 0 ... 1
-    Both are applied as changes, e^B - 1, so that short steps do not drift by rounding.
+        c - x0 -> e^(phi G) (c - x0) + dt psi v,   psi = integral of e^(phi G t), t = 0 ... 1
+    Both are applied as changes, e^B - 1, so that short steps do not drift by rounding. Forces F0,
+    F1 on the ends: v = v_s + (F0 + F1)/xi, and a couple (`laws.rod_mobility`) that turns the rod
+    for dt/2 before and after e^B.
 Symbols: W, S antisymmetric and symmetric part of G; phi = integral of the factor on the rate over
     the step; lambda_J = 1 - 2 mu; v_s settling velocity, weight less buoyancy of a bead over its
     drag; H = l / 2.
-Limits: exact in the strain of the step for any step; where a schedule changes the rate within it,
-    settling is taken at the mean rate (second order). The nodes are put at c -+ H p anew every
-    step, so a length cannot drift.
+Limits: exact in the strain of the step for any step, and for any force in a fluid at rest; where a
+    schedule changes the rate within it, settling is taken at the mean rate, where flow and a couple
+    turn a rod together, one after the other (both second order). The nodes are put at c -+ H p anew
+    every step, so a length cannot drift.
 """
 
 from functools import cache
@@ -19,6 +22,7 @@ from typing import Any
 import warp as wp
 
 from warpfiber.laws.flow import make_flow
+from warpfiber.laws.rod_mobility import make_rod_alignment, make_rod_mobility
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.exponential import make_exponential
 from warpfiber.passes.precision import group_struct
@@ -34,7 +38,7 @@ def rod_map(name: str) -> Any:
     class RodMap:
         turn: mat33  # e^B - 1
         move: mat33  # e^(phi G) - 1
-        settled: vec3  # what settling adds to the center
+        drift: mat33  # dt psi
         turning: mat33  # (1 - mu) G - mu G^T at the end of the step
         gradient: mat33  # G there
         settling: vec3  # v_s
@@ -83,7 +87,7 @@ def make_rod_maps(name: str, module: str = "unique"):
         m = RodMap()
         m.turn = mat33(turn)
         m.move = mat33(move)
-        m.settled = vec3(dt * (mean * settling))
+        m.drift = mat33(dt * mean)
         m.turning = mat33((one - mu) * now - mu * wp.transpose(now))
         m.gradient = end_gradient[1]
         m.settling = vec3(settling)
@@ -93,17 +97,20 @@ def make_rod_maps(name: str, module: str = "unique"):
 
 
 @cache
-def make_rod_step(name: str, module: str = "unique"):
+def make_rod_step(name: str, loaded: bool, module: str = "unique"):
     """Kernel `rod_step`: one step of every rod; rod f has the nodes 2 f and 2 f + 1.
 
     `keeps`: steps may be rejected, so the start is kept. `rod_shape`: which map moves a rod.
+    `node_load`: forces on the nodes, where the scene has any (`loaded`).
     """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
     RodMap = rod_map(name)
     flow_velocity, _ = make_flow(name)
-    half, endless = real(0.5), real(1.0e30)
+    turning_drag, _ = make_rod_mobility(name)
+    align = make_rod_alignment(name)
+    half, one, endless = real(0.5), real(1.0), real(1.0e30)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def rod_step(
@@ -114,6 +121,8 @@ def make_rod_step(name: str, module: str = "unique"):
         rod_shape: wp.array(dtype=wp.int32),
         groups: wp.array(dtype=Group),
         fiber_group: wp.array(dtype=wp.int32),
+        step_size: wp.array(dtype=wp.float64),
+        node_load: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         node_back: wp.array(dtype=vec3),
@@ -132,17 +141,32 @@ def make_rod_step(name: str, module: str = "unique"):
             node_back[first + 1] = x1
             velocity_back[first] = node_velocity[first]
             velocity_back[first + 1] = node_velocity[first + 1]
-        half_length = half * groups[fiber_group[fiber]].rest
+        g = groups[fiber_group[fiber]]
+        half_length = half * g.rest
+        drawn = m.settling
+        couple = vec3()
         axis = x1 - x0
-        axis = axis + m.turn * axis
+        if wp.static(loaded):
+            f0 = node_load[first]
+            f1 = node_load[first + 1]
+            beads = g.spacing + one
+            drawn = drawn + (one / (g.drag * beads)) * (f0 + f1)
+            weight = g.weight + g.weight_excess + g.weight_excess
+            couple = (half_length / turning_drag(g.torque, beads, weight)) * (f1 - f0)
+            spell = half * real(step_size[0])
+            axis = align(wp.normalize(axis), spell * couple)
+            axis = axis + m.turn * axis
+            axis = align(wp.normalize(axis), spell * couple)
+        else:
+            axis = axis + m.turn * axis
         arm = (half_length / wp.sqrt(wp.dot(axis, axis))) * axis
         center = half * (x0 + x1)
-        center = center + (m.move * (center - flow_origin) + m.settled)
+        center = center + (m.move * (center - flow_origin) + m.drift * drawn)
         node_pos[first] = center - arm
         node_pos[first + 1] = center + arm
 
-        velocity = flow_velocity(m.gradient, flow_origin, center) + m.settling
-        swing = m.turning * arm
+        velocity = flow_velocity(m.gradient, flow_origin, center) + drawn
+        swing = m.turning * arm + half_length * couple
         swing = swing - (wp.dot(swing, arm) / (half_length * half_length)) * arm
         node_velocity[first] = velocity - swing
         node_velocity[first + 1] = velocity + swing

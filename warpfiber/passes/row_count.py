@@ -248,7 +248,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                         ):
                             continue
                         for place in range(2 * first, wp.static(PLACES)):
-                            t, n, gap = array_place(
+                            t, normal, gap = array_place(
                                 place,
                                 xi,
                                 xi + a,
@@ -259,7 +259,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                                 shape,
                                 radius,
                             )
-                            if gap - wp.dot(n, move_i + t * wa) < keep * radius:
+                            if gap - wp.dot(normal, move_i + t * wa) < keep * radius:
                                 total += 1
         segment_rows_out[i] = total
 

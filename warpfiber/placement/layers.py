@@ -27,6 +27,7 @@ from warpfiber.placement.capsules import Floats, Ints
 from warpfiber.placement.orientations import draw_directions, match_moments
 from warpfiber.placement.slices import slices, votes
 from warpfiber.placement.space import Cell, wall_distance
+from warpfiber.placement.wedged import mirror_wedged
 
 ROUNDS = 40
 """Times that directions which do not fit are drawn again."""
@@ -61,6 +62,8 @@ class Stack:
     """whether each fiber stays in its layer"""
     law: str = "acg"
     """distribution of directions"""
+    mirror: float = 0.0
+    """sign of the shear that fibers are to turn in freely; 0: any direction"""
 
     def __len__(self) -> int:
         return len(self.share)
@@ -78,6 +81,8 @@ class Drawn:
     """that the center lies in, (n,)"""
     redrawn: int = 0
     """directions drawn again"""
+    mirrored: int = 0
+    """turned to the other side of the flow"""
     stuck: Ints | None = None
     """fibers for which no direction fits"""
 
@@ -158,9 +163,14 @@ def _drawn(
         bad = np.concatenate(left)
     if stack.inside:
         _turn_to(stack, direction, layer, half, radius, cell)
+    mirrored = 0
+    if stack.mirror != 0.0:
+        gap = float(cell.size[2]) - 2.0 * wall_distance(radius)
+        mirrored = mirror_wedged(direction, half, gap, stack.mirror)
     low, high = _range(stack, direction, layer, half, radius, cell)
     center = low + (high - low) * place
-    return Drawn(direction, center, layer, redrawn, bad if len(bad) else None)
+    stuck = bad if len(bad) else None
+    return Drawn(direction, center, layer, redrawn, mirrored, stuck)
 
 
 def _turn_to(

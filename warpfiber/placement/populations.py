@@ -10,6 +10,7 @@ Limits: boxes only; centers are random. Directions and centers change a little i
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,7 @@ from warpfiber.placement.orientations import orientation_tensor, values_from_ten
 from warpfiber.placement.parts import table_law
 from warpfiber.placement.slices import largest_a33, layer_averages, slices, votes
 from warpfiber.placement.space import Cell
+from warpfiber.placement.wedged import are_wedged
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError
 
 DEPTH = 0.05
@@ -59,7 +61,11 @@ class Population:
         back = np.argsort(order)
         self.stuck = None if drawn.stuck is None else order[drawn.stuck]
         self.drawn = Drawn(
-            drawn.direction[back], drawn.center[back], drawn.layer[back], drawn.redrawn
+            drawn.direction[back],
+            drawn.center[back],
+            drawn.layer[back],
+            drawn.redrawn,
+            drawn.mirrored,
         )
 
     def straight(self) -> list[Floats]:
@@ -106,6 +112,7 @@ def stack_of(scene: Scene, table: int, group: FiberGroup) -> Stack:
     assert scene.box is not None
     height = scene.box.size[2]
     key = f"fibers.{table}.orientation"
+    mirror = shear_sign(scene) if group.wedged == "mirror" else 0.0
     try:
         if group.layers is None:
             fraction = np.array([group.volume_fraction or 0.0])
@@ -116,6 +123,7 @@ def stack_of(scene: Scene, table: int, group: FiberGroup) -> Stack:
                 asked_tensor(group.orientation, group.direction)[None],
                 False,
                 group.orientation_law,
+                mirror,
             )
         tensor = []
         for k, layer in enumerate(group.layers):
@@ -130,7 +138,16 @@ def stack_of(scene: Scene, table: int, group: FiberGroup) -> Stack:
     share = thickness * fraction
     inside = group.layer_mode == "inside"
     law = group.orientation_law
-    return Stack(edges, share / share.sum(), fraction, np.array(tensor), inside, law)
+    return Stack(edges, share / share.sum(), fraction, np.array(tensor), inside, law, mirror)
+
+
+def shear_sign(scene: Scene) -> float:
+    """1 or -1 in a simple shear between walls of z, 0 in all else."""
+    if scene.flow is None or scene.flow.kind != "simple_shear" or scene.box is None:
+        return 0.0
+    gradient = scene.flow.velocity_gradient
+    assert gradient is not None
+    return float(np.sign(gradient[0][2])) if scene.box.boundary[2] == "wall" else 0.0
 
 
 def pack(
@@ -210,6 +227,8 @@ def population_report(scene: Scene, population: Population, strains: Floats) -> 
     gap = np.diff(stack.edges) if stack.inside else np.full(len(stack), stack.edges[-1])
     if not (stack.inside or population.cell.wall[2]):
         gap = np.full(len(stack), np.inf)
+    between = float(scene.box.size[2]) - 2.0 * population.radius
+    wedged = int(np.sum(are_wedged(tips, population.half, between, shear_sign(scene))))
     steepest = []
     for k in range(len(stack)):
         mine = population.length[home == k] if stack.inside else population.length
@@ -228,6 +247,8 @@ def population_report(scene: Scene, population: Population, strains: Floats) -> 
             "by_number": values_from_tensor(orientation_tensor(tips)),
         },
         "directions_redrawn": population.drawn.redrawn,
+        "directions_mirrored": population.drawn.mirrored,
+        "wedged": wedged,
         "bending_strain": {
             "maximum": float(strains.max(initial=0.0)),
             "mean": float(strains.mean()) if len(strains) else 0.0,
@@ -255,6 +276,13 @@ def population_report(scene: Scene, population: Population, strains: Floats) -> 
         ]
     report["missed"] = _missed(stack, by_number if stack.inside else cut.tensor, fraction, volume)
     report["missed"] += _beyond_reach(stack, [pair[0 if stack.inside else 1] for pair in steepest])
+    if wedged and scene.numerics.method == "rigid_rod":
+        line = (
+            f"{wedged} straight fibers are too long to turn between the walls; wedged there they "
+            'may hold up all others: fibers.wedged = "mirror" lays them to the other side'
+        )
+        report["missed"].append(line)
+        warnings.warn(line, RuntimeWarning, stacklevel=2)
     return report
 
 

@@ -20,11 +20,12 @@ import numpy as np
 from warpfiber.placement.capsules import Floats, axis_distance
 from warpfiber.placement.node_file import LENGTH_SPREAD, read_node_file
 from warpfiber.scene import Shape
+from warpfiber.scene.derived import SHORTEST_BOND
 
 ON_NODE = 1e-6
 """Distance of a corner from a node in segments that is rounding."""
-SHORTEST = 0.95
-"""Shortest chord of a segment in diameters: that of an arc of one diameter at curvature 1 / d."""
+SHORTEST = 0.95 * SHORTEST_BOND
+"""Shortest chord of a segment in diameters: arcs that curve by 1 / d have shorter ones."""
 
 
 def straight_nodes(
@@ -52,7 +53,9 @@ def rest_nodes(shape: Shape, length: float, segments: int, diameter: float) -> F
     closed = shape.kind == "ring"
     chord = float(np.min(np.linalg.norm(_edges(nodes, closed), axis=1)))
     if chord < SHORTEST * diameter:
-        raise ValueError(f"segments are {chord:.4g} m long, shorter than the diameter; use fewer")
+        raise ValueError(
+            f"segments are {chord:.4g} m long, shorter than half the diameter; use fewer"
+        )
     _refuse_self_overlap(nodes, closed, step, diameter)
     return nodes if closed else _along_x(nodes)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 
-from warpfiber.scene.containers import CYLINDER
 from warpfiber.scene.derived import INERTIALESS
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
@@ -45,11 +44,7 @@ def check_arrays(draft: Draft) -> None:
     taken: dict[str, int] = {}
     for index, wall in enumerate(draft.walls):
         path = f"wall.{index}"
-        if draft.faulty(path) or wall["kind"] == CYLINDER:
-            continue
-        if wall["kind"] != ARRAY:  # the default: nothing of a plane can be altered yet
-            remedy = 'not available in this version; planes come from box.boundary = "wall"'
-            draft.faults.add(f"{path}.kind", None, remedy)
+        if draft.faulty(path) or wall["kind"] != ARRAY:
             continue
         other = taken.setdefault(wall["name"], index)
         if other != index:

@@ -28,8 +28,6 @@ NOT_IN_THIS_VERSION: tuple[Row, ...] = (
         "remove the others from the list"),
     Row("record", "node_fields", ("velocity", "bond_stress", "contact_count"),
         "remove the others from the list"),
-    Row("wall", "kind", ("fiber_array", "cylinder"),
-        'remove the table; planes come from boundary = "wall", stages move them'),
 )  # fmt: skip
 
 

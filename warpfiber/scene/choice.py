@@ -107,6 +107,8 @@ def rod_error(draft: Draft, contact: bool = True) -> tuple[float, str]:
     """
     if draft.flow_object is None or not draft.fibers:
         return math.inf, "the scene has no flow"
+    if draft.loads:
+        return math.inf, "what a [[load]] bends is not known"
     pushes = contact and (draft.contact["law"] != "none" or bool(draft.axes("wall")))
     errors = [
         _group_error(group, f"fibers.{index}", draft.flow_object, pushes, _weight(draft, group))

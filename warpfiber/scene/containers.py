@@ -2,7 +2,8 @@
 
 Symbols: R radius, d diameter of a fiber; the axis goes through `center`, the middle of the height.
 Limits: one container of method bonded_spheres, upright; its side has no end, `height` says where
-    fibers are placed; bottom and lid are walls of the box. Friction is `contact.wall_friction`.
+    fibers are placed; bottom and lid are walls of the box. Friction is `contact.wall_friction`
+    unless it has its own.
 """
 
 from __future__ import annotations
@@ -40,9 +41,6 @@ def check_containers(draft: Draft) -> None:
             draft.blame(f"{path}.kind", remedy)
         if abs(wall["axis"][2]) < 1.0 - 1e-9:
             draft.blame(f"{path}.axis", "containers stand upright; use [0, 0, 1]")
-        if wall["friction"] is not None:
-            remedy = "remove it; contact.wall_friction is that of all walls"
-            draft.blame(f"{path}.friction", remedy)
         if wall["velocity"] is not None:
             draft.blame(f"{path}.velocity", "remove it; containers stand still")
         _check_room(draft, wall, path)

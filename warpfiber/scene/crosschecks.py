@@ -17,6 +17,7 @@ from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, check_gripping
 from warpfiber.scene.keys import Values
 from warpfiber.scene.loads import check_loads
+from warpfiber.scene.planes import check_planes
 from warpfiber.scene.pouring import check_pouring
 from warpfiber.scene.pressing import check_pressing
 from warpfiber.scene.resolving import COUNT_KEYS, LENGTH_KEYS, SEGMENT_KEYS
@@ -52,6 +53,7 @@ def cross_check(draft: Draft) -> None:
     _check_record(draft)
     check_arrays(draft)
     check_containers(draft)
+    check_planes(draft)
     check_loads(draft)
     check_pressing(draft)
     check_gripping(draft)

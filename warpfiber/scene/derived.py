@@ -18,6 +18,11 @@ INERTIALESS = ("overdamped", "rigid_rod")
 """Methods whose fibers have no mass."""
 REPULSION_REACH = 2.001
 """Center line distance in radii below which fibers repel (Sasayama & Inagaki 2018, appendix A)."""
+SHORTEST_BOND = 0.5
+"""Least length of a segment of bonded spheres in diameters: nodes stand at least a radius apart.
+
+Other methods have a bead per diameter, and so segments of a diameter at least.
+"""
 LUBRICATION_REACH = 3.0
 """Center line distance in radii below which the fluid film between fibers acts (as above)."""
 

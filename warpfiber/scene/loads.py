@@ -8,21 +8,26 @@ from __future__ import annotations
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.keys import Values
 
-LOADED_METHODS = ("overdamped", "bonded_spheres")
-"""Methods that know forces on nodes, held nodes and frozen fibers."""
+LOADED_METHODS = ("overdamped", "rigid_rod", "bonded_spheres")
+"""Methods that know forces on nodes."""
+HOLDING_METHODS = ("overdamped", "bonded_spheres")
+"""Methods that know held nodes and frozen fibers too."""
 ADVICE = 'use method = "overdamped", without a fluid "bonded_spheres"'
 
 
 def check_loads(draft: Draft) -> None:
     """Run all rules; faults and notes go to the draft's list."""
-    if draft.method not in LOADED_METHODS and draft.method is not None:
-        if draft.loads:
-            remedy = f"not available in method {draft.method}; {ADVICE}, or remove it"
-            draft.faults.add("load", None, remedy)
+    refusal = f"not available in method {draft.method}; {ADVICE}, or remove it"
+    if draft.method not in HOLDING_METHODS and draft.method is not None:
         for index, group in enumerate(draft.fibers):
             if group["frozen"]:
-                remedy = f"not available in method {draft.method}; {ADVICE}, or remove it"
-                draft.blame(f"fibers.{index}.frozen", remedy)
+                draft.blame(f"fibers.{index}.frozen", refusal)
+        for index, load in enumerate(draft.loads):
+            if draft.method in LOADED_METHODS and load["hold"] not in ("free", None):
+                draft.blame(f"load.{index}.hold", refusal)
+    if draft.method not in LOADED_METHODS and draft.method is not None:
+        if draft.loads:
+            draft.faults.add("load", None, refusal)
         return
     taken: dict[tuple[int, int, int], int] = {}
     for index, load in enumerate(draft.loads):
@@ -59,9 +64,12 @@ def _check_action(draft: Draft, load: Values, path: str) -> None:
         draft.blame(f"{path}.force", remedy)
     elif not held and load["velocity"] is not None:
         remedy = 'a free node has no given velocity; add hold = "position" or "clamp"'
+        if draft.method not in HOLDING_METHODS:
+            remedy = "a free node has no given velocity; give force in N"
         draft.blame(f"{path}.velocity", remedy)
     elif not held and load["force"] is None:
-        draft.faults.add(path, None, 'does nothing; give force in N, or hold = "position"')
+        held_too = ', or hold = "position"' if draft.method in HOLDING_METHODS else ""
+        draft.faults.add(path, None, f"does nothing; give force in N{held_too}")
 
 
 def _check_frozen(draft: Draft, load: Values, path: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from warpfiber.scene.derived import fiber_volume
+from warpfiber.scene.derived import SHORTEST_BOND, fiber_volume
 from warpfiber.scene.draft import Draft
 from warpfiber.scene.faults import number_text
 from warpfiber.scene.gripping import GRIPPING, strain_time
@@ -199,7 +199,8 @@ def _resolve_segments(draft: Draft) -> None:
 def _segments(draft: Draft, group: Values, index: int, place: str, asked: float) -> int | None:
     """Return the whole number of segments of one group; None with a fault if M < 1 would follow."""
     beads = float(group["aspect_ratio"]) - 1.0
-    most = math.floor(beads * (1.0 + ROUNDING))
+    shortest = SHORTEST_BOND if draft.method == "bonded_spheres" else 1.0
+    most = math.floor(beads / shortest * (1.0 + ROUNDING))
     name = f"fibers.{index}"
     if most < 1:
         key = draft.given(name, LENGTH_KEYS)
@@ -208,14 +209,16 @@ def _segments(draft: Draft, group: Values, index: int, place: str, asked: float)
     ratio = number_text(group["aspect_ratio"])
     if place.endswith(".segments"):
         if asked > most:
-            remedy = f"too many for {name} with aspect ratio {ratio}; at most {most} = one per bead"
+            least = "one per bead" if shortest == 1.0 else "half a diameter each"
+            remedy = f"too many for {name} with aspect ratio {ratio}; at most {most} = {least}"
             draft.blame(place, remedy)
             return None
         return int(asked)
     if place.endswith(".segment_length"):
-        diameter = group["diameter"]
-        if asked < diameter * (1.0 - ROUNDING):
-            remedy = f"shorter than the diameter of {name}; give at least {number_text(diameter)}"
+        least_length = shortest * group["diameter"]
+        if asked < least_length * (1.0 - ROUNDING):
+            than = "the diameter" if shortest == 1.0 else "half the diameter"
+            remedy = f"shorter than {than} of {name}; give at least {number_text(least_length)}"
             draft.blame(place, remedy)
             return None
         return min(most, max(1, round(float(group["centerline_length"]) / asked)))

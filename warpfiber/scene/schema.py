@@ -141,6 +141,7 @@ FIBERS = Table(
         Key("volume_fraction", FRACTION),
         Key("layers", Either((Inline(LAYER, many=True), CSV_FILE))),
         Key("layer_mode", Choice(("span", "inside"))),
+        Key("wedged", Choice(("keep", "mirror")), default="keep"),
         Key("aspect_ratio", Number(above=1, below=1e6)),
         Key("length", LENGTH),
         Key("centerline_length", LENGTH),

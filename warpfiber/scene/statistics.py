@@ -132,6 +132,8 @@ def resolve_layers(draft: Draft, group: Values, path: str) -> None:
     """Replace `layers` by a tuple of `Layer`; `volume_fraction` becomes their mean."""
     values, place = group["layers"], dotted(path, "layers")
     if not draft.is_given(place):
+        if draft.is_given(dotted(path, "wedged")) and group["length_distribution"] is None:
+            draft.note(f"{path}.wedged has no effect without layers or a length_distribution")
         if draft.is_given(dotted(path, "layer_mode")):
             draft.note(f"{path}.layer_mode has no effect without layers")
         group["layers"] = group["layer_mode"] = None

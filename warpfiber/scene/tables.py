@@ -183,6 +183,8 @@ class FiberGroup:
     layers: tuple[Layer, ...] | None = None
     layer_mode: str | None = None
     """span: fibers reach through layers; inside: each stays in its own"""
+    wedged: str = "keep"
+    """mirror: drawn fibers too long to turn between the walls lie on the other side of the shear"""
     table: int | None = None
     """number of the [[fibers]] that this group was split off from"""
     inextensible: bool = False

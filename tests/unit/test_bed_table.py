@@ -1,0 +1,110 @@
+"""The table of beds over seeds: branches, values at a fraction, yields, means and deviations."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+TOOL = Path(__file__).parents[2] / "tools" / "bed_table.py"
+
+
+def _tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("bed_table", TOOL)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+bed_table = _tool()
+
+
+def written(folder: Path, columns: dict[str, np.ndarray], ends: list[float], stages: list) -> Path:
+    """A run folder with these rows, ends of stages and results."""
+    folder.mkdir()
+    table = np.stack(list(columns.values()), axis=1)
+    header = ",".join(columns)
+    np.savetxt(folder / "scalars.csv", table, delimiter=",", header=header, comments="")
+    lines = [f"[  1.00 s] stage 'a' ended at time {end:g} s" for end in ends]
+    (folder / "log.txt").write_text("\n".join(["begun", *lines]))
+    (folder / "summary.json").write_text(json.dumps({"stages": stages}))
+    return folder
+
+
+def cycles(folder: Path, scale: float) -> Path:
+    """Settling for 1 s, then two loadings by scale phi^6, each with an unloading at half of it."""
+    time = np.arange(1, 501) * 0.01
+    part = np.minimum(((time - 1e-9) // 1.0).astype(int), 4)
+    inside = time - part
+    loads, unloads = (part == 1) | (part == 3), (part == 2) | (part == 4)
+    phi = np.where(loads, 0.2 + 0.22 * inside, np.where(unloads, 0.42 - 0.22 * inside, 0.2))
+    shift = np.where(part >= 3, 0.9, 1.0)
+    pressure = scale * shift * phi**6 * np.where(unloads, 0.5, 1.0) * (part > 0)
+    columns = {
+        "step": np.arange(500.0),
+        "time": time,
+        "pressure_low": np.where(part == 0, 100.0, pressure + 100.0),
+        "pressure_high": pressure,
+        "volume_fraction": phi,
+        "coordination_number": 40.0 * phi,
+        "contact_force_mean": 0.1 * phi,
+        "inclination_mean": 30.0 - 2.0 * part,
+        "inclination_00_10": 0.1 * part,
+        "inclination_10_20": np.full(500, 0.15),
+    }
+    return written(folder, columns, [1.0, 2.0, 3.0, 4.0, 5.0], [])
+
+
+def test_pressed(tmp_path: Path) -> None:
+    """First loading, shift of the second, unloading, inclination before and after."""
+    found = bed_table.figures(cycles(tmp_path / "run", 1e6))
+    assert found["P low at rest, Pa"] == pytest.approx(100.0)
+    assert found["P 0.35, kPa"] == pytest.approx(1e3 * 0.35**6, rel=2e-3)
+    assert found["P low 0.35, kPa"] == pytest.approx(1e3 * 0.35**6 + 0.1, rel=2e-3)
+    assert found["P 0.35 unloading, kPa"] == pytest.approx(0.5e3 * 0.35**6, rel=2e-3)
+    assert found["Z 0.40"] == pytest.approx(16.0, rel=2e-3)
+    assert found["F 0.30, mN"] == pytest.approx(30.0, rel=2e-3)
+    assert found["exponent"] == pytest.approx(6.0, rel=1e-3)
+    first = 1e-3 ** (1.0 / 6.0)
+    assert found["phi at 1 kPa, cycle 1"] == pytest.approx(first, abs=2.3e-3)
+    second = first / 0.9 ** (1.0 / 6.0)
+    assert found["phi at 1 kPa, cycle 2"] == pytest.approx(second, abs=2.3e-3)
+    assert found["inclination at rest"] == 30.0 and found["mode at rest"] == 15.0
+    assert found["inclination after cycle 1"] == 26.0 and found["mode after cycle 1"] == 5.0
+
+
+def test_pulled_and_sheared(tmp_path: Path) -> None:
+    strain = np.linspace(0.0, 2.0, 201)[1:]
+    columns = {
+        "time": strain,
+        "grip_strain": strain,
+        "stress_zz": 1e4 * np.exp(-strain),
+        "coordination_number": np.where(strain > 1.0, 12.0, 6.0),
+    }
+    pull = {"stage": "pull", "yield_stress_zz": 2e4, "yield_strain": 0.5}
+    found = bed_table.figures(written(tmp_path / "pull", columns, [2.0], [pull]))
+    assert found["yield tension, kPa"] == 20.0 and found["its strain"] == 0.5
+    assert found["stress at twice that strain over peak"] == pytest.approx(0.5 * np.exp(-1.0))
+    shear = {"stage": "shear", "yield_stress_xz": 3e4, "standard_deviation": 2e3}
+    found = bed_table.figures(written(tmp_path / "shear", columns, [2.0], [shear]))
+    assert found["yield shear, kPa"] == 30.0 and found["Z, second half"] == 12.0
+
+
+def test_over_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Mean and deviation of one run; a quantity that a run lacks does not count."""
+    folders = [str(cycles(tmp_path / str(k), scale)) for k, scale in enumerate((1e6, 2e6, 3e6))]
+    table = bed_table.summed([bed_table.figures(Path(folder)) for folder in folders])
+    mean, spread, count = table["P 0.40, kPa"]
+    unit = 1e3 * 0.4**6
+    assert (mean, spread, count) == pytest.approx((2.0 * unit, unit, 3), rel=2e-3)
+    assert table["exponent"][1] < 1e-9
+    assert bed_table.summed([{"a": 1.0}, {"a": np.nan, "b": 2.0}])["a"][::2] == (1.0, 1)
+    bed_table.main(folders)
+    assert "P 0.40, kPa" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        bed_table.main([])
