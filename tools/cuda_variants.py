@@ -45,6 +45,7 @@ from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
+from warpfiber.passes.prune_kernels import make_plain_prune, make_wide_kernels
 from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
 from warpfiber.passes.row_count import RowFeatures, make_row_count
@@ -120,6 +121,8 @@ FULLEST: tuple[Variant, ...] = (
     (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
+    (make_wide_kernels, ()),
+    (make_plain_prune, (True,)),
     (make_measure_fibers, (MeasureFeatures(True, True, True, ALL),)),
     (make_measure_layers, (True,)),
     (make_measure_stress, ()),
@@ -157,6 +160,7 @@ PLAINEST: tuple[Variant, ...] = (
     (make_row_fill, (RowFeatures(True, lubrication="paper"),)),
     (make_check_sweeps, (CheckFeatures(),)),
     (make_pair_motion, (False,)),
+    (make_plain_prune, (False,)),
     (make_measure_fibers, (MeasureFeatures(inertia=False),)),
     (make_measure_fibers, (MeasureFeatures(energy=True, curvature=True, inertia=False),)),
     (make_measure_layers, (False,)),

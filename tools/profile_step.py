@@ -98,7 +98,7 @@ def list_state(method: Any) -> tuple[int, float]:
 def print_list(method: Any, count: int, builds: int, seconds: float, steps: int) -> None:
     """Statistics of the neighbor list."""
     pairs, report = method.list, method.list_report()
-    kept = max(1, pairs.pair_count)
+    kept = max(1, pairs.kept_count)
     acting = int(method.pair_acts.numpy()[: pairs.pair_count].astype(bool).sum())
     rows = {
         "builds": f"{builds} in {steps} steps",

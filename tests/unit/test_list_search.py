@@ -135,7 +135,7 @@ def test_few_candidates(start: Start) -> None:
     axes = isotropic(rng, count)
     fibers = [straight_fiber(kind, p, edge * rng.random(3)) for p in axes]
     sim = cell(start, (kind,), fibers, box={"size": [edge] * 3})
-    kept, looked = sim.method.list.pair_count, sim.method.list.search_counts()
+    kept, looked = sim.method.list.kept_count, sim.method.list.search_counts()
     assert kept > count
     assert kept <= looked["confirmed"] <= 1.02 * kept
     assert looked["compared"] <= 6 * kept

@@ -14,6 +14,7 @@ pytest.importorskip("matplotlib")
 from matplotlib.image import imread  # noqa: E402
 
 from warpfiber.output.cell import closed_lines  # noqa: E402
+from warpfiber.output.curves import GREEN, ORANGE  # noqa: E402
 from warpfiber.output.folder import ResultFolder  # noqa: E402
 from warpfiber.output.plots import plot_run  # noqa: E402
 from warpfiber.output.scalars import ScalarsWriter  # noqa: E402
@@ -117,6 +118,18 @@ def test_several_runs_share_axes(tmp_path: Path) -> None:
     written = plot_run(runs, tmp_path / "both")
     assert written[0] == tmp_path / "both" / "orientation.png"
     assert {row["run"] for row in _table(tmp_path / "both" / "orientation.csv")} == {"a", "b"}
+
+
+def test_a_curve_under_another_is_seen(tmp_path: Path) -> None:
+    """Contacts and touching fibers are the same of rods: the lower line is drawn wider."""
+    from matplotlib.colors import to_rgb
+
+    columns = ("contacts_per_fiber", "coordination_number")
+    folder = _run(tmp_path / "r", columns=columns)
+    (picture,) = [path for path in plot_run(folder) if path.stem == "interactions"]
+    shown = imread(picture)[:, :850, :3]  # without the words beside the axes
+    seen = [int((np.abs(shown - to_rgb(c)).max(axis=2) < 0.02).sum()) for c in (ORANGE, GREEN)]
+    assert min(seen) > 500
 
 
 def test_references_beside_the_scene_are_drawn(tmp_path: Path) -> None:

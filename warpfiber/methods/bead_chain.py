@@ -65,6 +65,7 @@ class BeadChain(Method):
                 workers=self.workers,
                 native=self.native,
                 pair_cost=PAIR_COST,
+                prunes=True,
             )
             self.list, self.skin = self.search.list, self.search.skin
             self.strain_end = self.search.strain_end
@@ -122,8 +123,10 @@ class BeadChain(Method):
         if status[TORN]:
             return False
         if status[EXPIRED] and self.search is not None:
-            self.search.choose_skin(self.step_count)
-            self.refresh_list()
+            if not self.search.prune(self.step_count):
+                self.search.choose_skin(self.step_count)
+                self.refresh_list()
+            self.list_seconds = self.search.seconds
         return True
 
     def close(self) -> None:

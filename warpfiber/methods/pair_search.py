@@ -21,6 +21,7 @@ from warpfiber.scene import Scene
 
 # as PAIR_COST: the rows and the check of an implicit step look at every listed pair
 STEP_PAIR_COST = 16.0
+PRUNED_FROM = 2000  # segments; pruning smaller lists costs its calls more than it saves
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1
 
@@ -29,7 +30,8 @@ class PairSearch:
     """Neighbor list and skin; lengths in run units.
 
     `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
-    of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters.
+    of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters;
+    `prunes`: whether the list may be pruned from a wider one.
     """
 
     def __init__(
@@ -44,16 +46,20 @@ class PairSearch:
         native: bool | None = None,
         pair_cost: float = STEP_PAIR_COST,
         most_skin: float = MOST_SKIN,
+        prunes: bool = False,
     ) -> None:
         self.most_skin = most_skin
-        self.pair_cost = pair_cost
         self.scene, self.model, self.state = scene, model, state
         self.pair_cost = pair_cost
-        self.seconds = 0.0  # spent on builds
+        self.seconds = self.prune_seconds = 0.0  # spent on builds and pruning, on pruning alone
         self.radius = max(row["radius"] for row in model.group_rows)
         skin = START_SKIN * 2.0 * self.radius
         if scene.numerics.skin is not None:
             skin = scene.numerics.skin / model.units.length
+        prunes = prunes and scene.numerics.skin is None and model.segment_count >= PRUNED_FROM
+        origin = np.zeros(3)
+        if scene.flow is not None and scene.flow.origin is not None:
+            origin = np.asarray(scene.flow.origin) / model.units.length
         self.list = NeighborList(
             model,
             state,
@@ -63,9 +69,12 @@ class PairSearch:
             stretch=stretch,
             workers=workers,
             native=native,
+            flow_origin=origin if prunes else None,
         )
         self.lasting = lasting_height(scene) / model.units.length
         self.skin = self._skin_choice(skin)
+        if prunes:
+            self.set_skin(skin, self.skin.first_margin())
         self.strain_end = self.bearable_strain()
 
     def _skin_choice(self, skin: float) -> SkinChoice:
@@ -85,6 +94,7 @@ class PairSearch:
             pieces_per_segment=pairs.piece_count / self.model.segment_count,
             pair_cost=self.pair_cost,
             fixed=self.scene.numerics.skin is not None,
+            pruned=pairs.pruning is not None,
         )
 
     def _largest_skin(self, start: float) -> float:
@@ -94,8 +104,13 @@ class PairSearch:
 
     def _room(self) -> float:
         """Height of the box beyond what a list without skin and extension takes."""
+        return self.lasting - self._bare_width
+
+    @property
+    def _bare_width(self) -> float:
+        """Of the cells of a list without skin and extension."""
         pairs = self.list
-        return self.lasting - (pairs.cell_width - pairs.skin - 2.0 * pairs.extension)
+        return pairs.cell_width - pairs.skin - pairs.margin - 2.0 * pairs.extension
 
     def bearable_strain(self) -> float:
         """Strain that the box can bear; raises SceneError if it is too small from the start."""
@@ -108,14 +123,13 @@ class PairSearch:
         With the start skin and no extension: a run and its continuation have chosen others when
         they ask.
         """
-        pairs = self.list
-        return pairs.cell_width - pairs.skin - 2.0 * pairs.extension + self.skin.start
+        return self._bare_width + self.skin.start
 
-    def set_skin(self, skin: float) -> None:
-        """Another skin, from the next list on."""
-        self.skin.set_skin(skin)
-        if skin != self.list.skin:
-            self.list.set_skin(skin)
+    def set_skin(self, skin: float, margin: float | None = None) -> None:
+        """Another skin, and margin of a wide list, from the next build on."""
+        self.skin.set_skin(skin, margin)
+        if (skin, self.skin.margin) != (self.list.skin, self.list.margin):
+            self.list.set_skin(skin, self.skin.margin)
 
     def set_stretch(self, stretch: float) -> None:
         """Take over a stretch of segments, from the next list on."""
@@ -142,7 +156,8 @@ class PairSearch:
     def choose_skin(self, step: int, used: float | None = None) -> None:
         """Another skin, the present one being used up; `used` of it per step, if that is known."""
         listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
-        self.set_skin(self.skin.choose(step, listed, used))
+        skin = self.skin.choose(step, listed, used)
+        self.set_skin(skin, self.skin.choose_margin(skin, listed))
 
     def use_up(self, step: int, use: np.ndarray | None = None) -> bool:
         """Choose the next skin, the present one being used up; False if none would last a step.
@@ -172,6 +187,21 @@ class PairSearch:
             return 0.0
         return float(use[1] / use[2])
 
+    def prune(self, step: int) -> bool:
+        """Prune the wide list anew, the present one being used up; False if a build is due."""
+        pruning = self.list.pruning
+        if pruning is None or self.list.margin == 0.0:
+            return False
+        begin = time.perf_counter()
+        holds = pruning.holds()
+        if holds:
+            pruning.prune()
+            self.skin.wear(step)
+        taken = time.perf_counter() - begin
+        self.seconds += taken
+        self.prune_seconds += taken
+        return holds
+
     def refresh(self, step: int, *, wrap: bool = True) -> bool:
         """Build the list now (also clears its expiry); True if pair arrays were replaced."""
         begin, pairs = time.perf_counter(), self.list
@@ -199,6 +229,10 @@ class PairSearch:
             "pairs": pairs.pair_count,
             "pieces": pairs.piece_count,
         }
+        if pairs.pruning is not None:
+            wide = choice.skin + pairs.margin
+            report |= {"wide_skin_diameters": round(wide / diameter, 4)}
+            report |= {"prunes": pairs.pruning.count - pairs.build_count}
         return report | pairs.search_counts()
 
     def close(self) -> None:
@@ -211,19 +245,27 @@ class PairSearch:
         """What the next list depends on."""
         allowed = np.asarray(self.list.stretch_allowed)
         extension = np.asarray(self.list.extension)
-        return {"stretch_allowed": allowed, "extension": extension, "skin": self.skin.saved()}
+        known = {"stretch_allowed": allowed, "extension": extension, "skin": self.skin.saved()}
+        pruning = self.list.pruning
+        return known | (pruning.saved() if pruning is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> bool:
         """Build again the list that the saved run had, which was built from older positions."""
-        state = self.state
+        state, pruning = self.state, self.list.pruning
+        saved = arrays["skin"]
         self.set_stretch(float(arrays["stretch_allowed"]))
-        self.set_skin(float(arrays["skin"][0]))
+        self.set_skin(float(saved[0]), float(saved[4]) if pruning is not None else None)
         self.set_extension(float(arrays["extension"]))
         self.skin.begun = step
-        state.node_pos.assign(arrays["list_pos"])
-        state.lattice.assign(arrays["list_lattice"])
+        head = "list" if pruning is None else "wide"
+        state.node_pos.assign(arrays[f"{head}_pos"])
+        state.lattice.assign(arrays[f"{head}_lattice"])
         replaced = self.refresh(step, wrap=False)
-        self.skin.restore(arrays["skin"])
+        if pruning is not None:
+            state.node_pos.assign(arrays["list_pos"])
+            state.lattice.assign(arrays["list_lattice"])
+            pruning.restore(arrays)
+        self.skin.restore(saved)
         for name in ("node_pos", "lattice", "deformation"):
             getattr(state, name).assign(arrays[name])
         return replaced

@@ -5,15 +5,15 @@ Builds tell u and the number of pairs; how the number changes with s follows fro
 a segment, 4/3 pi H^3 + 2 pi l H^2 + pi l^2 H / 2 for randomly oriented neighbors nearer than H
 (excluded volume of spherocylinders, Onsager 1949).
 
-One list of one skin against others: sums of parts measured on one state, with lives counted along
-one run (20,000 segments of 5 diameters, V_f = 0.1, SIMD, strain 0.001 per step; ns per segment-step
-of list and pair sweep, skins in diameters). One list: 26 with a skin of 0.6 (build 249, every 15
-steps, sweep 9.4), 25 of 0.8. An outer list of 1.2 (build 348, every 32 steps) and one of 0.3
-filtered from it (distances 18, index 3, every 7 steps, sweep 5.9): 20, which is 5 of some 50 in
-all, for a second test of validity and a second list to save. Skins and extensions by the speed of
-each segment last 18 steps with the pairs that one skin needs for 14: few fibers, pushed by others,
-end any list (with half as many pairs 21 of the 20,000 segments in 20 steps, 136 in 40), so that
-such skins pay only if these are listed anew on their own.
+Where the list is pruned from a wider one (`passes.pruning`), the skin and the number of times that
+it is used up before the cells are searched again are chosen together. Measured as sums of parts
+(20,000 segments of 5 diameters, V_f = 0.1, SIMD, strain 0.001 per step; ns per segment-step of list
+and pair sweep, skins in diameters): one list 26 with a skin of 0.6 (build 249, every 15 steps,
+sweep 9.4), 25 of 0.8; a wide one of 1.2 (build 348, every 32 steps) and one of 0.3 pruned from it
+(21, every 7 steps, sweep 5.9) 20. Skins and extensions by the speed of each segment last 18 steps
+with the pairs that one skin needs for 14: few fibers, pushed by others, end any list (with half as
+many pairs 21 of the 20,000 segments in 20 steps, 136 in 40), so that such skins pay only if these
+are listed anew on their own.
 
 Nothing here looks at a clock: two runs, and a run and its continuation, choose the same skins and
 so build at the same steps.
@@ -34,6 +34,11 @@ RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
 LASTING = 1.3  # uses of a step that a skin must have room for
+# of a wide list: of a piece, of what it finds around it at the first skin, of a listed pair
+WIDE_PIECE, WIDE_NEAR, WIDE_PAIR = 64.0, 121.0, 35.0
+PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 8.0  # of a pair of the wide list, of a segment beside
+START_TIMES, MOST_PRUNED = 2, 12  # skins used up before cells are searched again
+UNEVEN = 1.1  # what a wide list holds more, since skins are used up unevenly
 MEMORY = 0.5  # weight of the use before in the mean
 # Measured: listed pairs grow with the volume from this part of the distance in contact on.
 CORE = 0.85
@@ -54,8 +59,11 @@ class SkinChoice:
     pieces_per_segment: float
     pair_cost: float = PAIR_COST
     fixed: bool = False
+    pruned: bool = False  # from a wide list, whose margin beyond the skin is chosen too
+    margin: float = 0.0
     use: float = 0.0  # skin per step; 0 as long as nothing is known
     built_step: int = 0
+    renewed_step: int = 0  # built or pruned
     # for the report: the mean over steps and what made it
     begun: int = 0  # earlier steps are those of another process
     listed: float = 0.0  # skin of the present list
@@ -73,6 +81,15 @@ class SkinChoice:
         self.steps += taken
         self.skin_steps += taken * self.listed
         self.built_step, self.listed = step, self.skin
+        self.renewed_step = step
+
+    def wear(self, step: int) -> None:
+        """A pruned list was used up at `step`."""
+        self._use(self.skin / max(1, step - self.renewed_step))
+        self.renewed_step = step
+
+    def _use(self, used: float) -> None:
+        self.use = used if self.use == 0.0 else MEMORY * self.use + (1.0 - MEMORY) * used
 
     def _steps_since(self, step: int) -> int:
         return max(0, step - max(self.built_step, self.begun))
@@ -84,10 +101,10 @@ class SkinChoice:
         """
         least_lasting = 0.0
         if used is None:
-            used = self.skin / max(1, step - self.built_step)
+            used = self.skin / max(1, step - self.renewed_step)
         else:
             least_lasting = LASTING * max(used, self.use)
-        self.use = used if self.use == 0.0 else MEMORY * self.use + (1.0 - MEMORY) * used
+        self._use(used)
         if self.fixed or pairs_per_segment <= 0.0:
             return self.skin
         low = max(self.least, self.skin / LARGEST_CHANGE)
@@ -107,21 +124,66 @@ class SkinChoice:
 
     def cost(self, skin: float, pairs_per_segment: float) -> float:
         """ns per segment-step, with `pairs_per_segment` at the present skin."""
-        core = self.volume(CORE * self.core)
-        now = self.volume(self.reach + self.skin) - core
-        pairs = pairs_per_segment * (self.volume(self.reach + skin) - core) / now
-        near = self._around(skin) / self._around(2.0 * START_SKIN * self.radius)
-        build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * near)
+        per_volume = pairs_per_segment / self._listed_volume(self.skin)
+        if self.pruned:
+            return self._pruned_least(skin, per_volume)[0]
+        pairs = per_volume * self._listed_volume(skin)
+        build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * self._near(skin))
         return build / max(1.0, skin / self.use) + self.pair_cost * pairs
+
+    def first_margin(self) -> float:
+        """As long as nothing is known."""
+        has_room = self._margin(self.skin, START_TIMES) <= self.largest - self.skin
+        return self._margin(self.skin, START_TIMES if has_room else 1)
+
+    def choose_margin(self, skin: float, pairs_per_segment: float) -> float:
+        """Margin of the wide list beyond this skin, with these pairs at the present one."""
+        if not self.pruned or pairs_per_segment <= 0.0:
+            return self.margin
+        per_volume = pairs_per_segment / self._listed_volume(self.skin)
+        return self._margin(skin, self._pruned_least(skin, per_volume)[1])
+
+    def _pruned_least(self, skin: float, per_volume: float) -> tuple[float, int]:
+        """Least cost and how often the skin is then used up; one minimum, bounded by the box."""
+        least, times = math.inf, 0
+        for n in range(1, MOST_PRUNED + 1):
+            if n > 1 and self._margin(skin, n) > self.largest - skin:
+                break
+            cost = self._pruned_cost(skin, n, per_volume)
+            if cost >= least:
+                break
+            least, times = cost, n
+        return least, times
+
+    @staticmethod
+    def _margin(skin: float, times: int) -> float:
+        return UNEVEN * (times - 1) * skin
+
+    def _pruned_cost(self, skin: float, times: int, per_volume: float) -> float:
+        wide = skin + self._margin(skin, times)
+        lasts, wide_pairs = max(1.0, skin / self.use), per_volume * self._listed_volume(wide)
+        build = self.pieces_per_segment * (WIDE_PIECE + WIDE_NEAR * self._near(wide))
+        pruning = PRUNE_SEGMENT + PRUNE_PAIR * wide_pairs
+        renewing = (pruning + (build + WIDE_PAIR * wide_pairs) / times) / lasts
+        return renewing + self.pair_cost * per_volume * self._listed_volume(skin)
+
+    def _listed_volume(self, skin: float) -> float:
+        return self.volume(self.reach + skin) - self.volume(CORE * self.core)
+
+    def _near(self, skin: float) -> float:
+        """What lies around a segment, in that at the first skin."""
+        return self._around(skin) / self._around(2.0 * START_SKIN * self.radius)
 
     def _around(self, skin: float) -> float:
         """Volume around a segment in which midpoints are compared."""
         wide = self.reach + skin + 0.5 * self.length
         return wide * wide * (self.length + 4.0 / 3.0 * wide)
 
-    def set_skin(self, skin: float) -> None:
-        """Another skin."""
+    def set_skin(self, skin: float, margin: float | None = None) -> None:
+        """Another skin, and margin as far as the box has room for it."""
         self.skin = skin
+        wanted = self.margin if margin is None else margin
+        self.margin = min(wanted, max(0.0, self.largest - skin))
 
     def mean(self, step: int) -> float:
         """Mean skin over the steps so far."""
@@ -135,9 +197,12 @@ class SkinChoice:
 
     def saved(self) -> np.ndarray:
         """What a continued run needs to choose the same."""
-        return np.asarray([self.skin, self.use, float(self.built_step)])
+        known = [self.skin, self.use, float(self.built_step)]
+        return np.asarray([*known, float(self.renewed_step), self.margin] if self.pruned else known)
 
     def restore(self, saved: np.ndarray) -> None:
         """Take over what `saved` returned."""
         self.skin, self.use = float(saved[0]), float(saved[1])
-        self.built_step = int(saved[2])
+        self.built_step = self.renewed_step = int(saved[2])
+        if self.pruned:
+            self.renewed_step, self.margin = int(saved[3]), float(saved[4])

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 Table = dict[str, NDArray[Any]]
 TIP_FIBERS = 10  # more curves than this say nothing
+COVERS = 0.02  # curves as near as this part of their largest value in the mean look like one
 _DPI = 160
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -181,6 +182,14 @@ def _known(curves: Curves, run: _Run) -> list[str]:
     return [name for name in curves.columns if _finite(run.table, name)]
 
 
+def _is_covered(curves: Curves, run: _Run, name: str) -> bool:
+    """Whether a curve that is drawn later lies on this one and would hide it."""
+    names, y = _known(curves, run), run.table[name].astype(float)
+    least = COVERS * float(np.nanmax(np.abs(y)))
+    apart = [np.abs(run.table[other] - y) for other in names[names.index(name) + 1 :]]
+    return any(float(np.nanmean(way)) <= least for way in apart)
+
+
 def _draw_curves(
     curves: Curves, runs: Sequence[_Run], references: Mapping[str, Table], path: Path
 ) -> bool:
@@ -208,7 +217,8 @@ def _draw_curves(
             if not np.isfinite(shown).any():
                 continue
             dash = _DASHES[drawn.index(run) % len(_DASHES)]
-            axes.plot(x, shown, color=color, linestyle=dash, linewidth=1.6, zorder=3)
+            width = 4.8 if _is_covered(curves, run, name) else 1.6
+            axes.plot(x, shown, color=color, linestyle=dash, linewidth=width, zorder=3)
             known = shown[np.isfinite(shown)]
             lasts.append(np.median(known[-max(1, len(known) // 30) :]))
             rows += [[run.label, name, a, b] for a, b in zip(x, y, strict=True)]

@@ -21,7 +21,8 @@ from warpfiber.scene import Fault, Scene, SceneError
 from warpfiber.scene.starting import saved_stage_name
 
 Arrays = Mapping[str, NDArray[Any]]
-LISTED = ("list_pos", "list_lattice")  # of the neighbor list, along with all `contact_` arrays
+# of the neighbor list, along with all `contact_` arrays
+LISTED = ("list_pos", "list_lattice", "wide_pos", "wide_lattice", "wide_deformation")
 
 
 def write_saved_stage(folder: Path, name: str, arrays: Arrays, attrs: Mapping[str, Any]) -> Path:

@@ -19,8 +19,18 @@ Launches = list[Launch | Call]
 def list_launches(pairs: NeighborList) -> Launches:
     """Fibers into the box, pieces into cells, pairs out of them."""
     if pairs.native:
-        return [*_bin(pairs), _native_sort(pairs), _gather(pairs), *_native_pairs(pairs)]
-    return [*_bin(pairs), *_plain_sort(pairs), _gather(pairs), *_plain_pairs(pairs)]
+        found = [*_bin(pairs), _native_sort(pairs), _gather(pairs), *_native_pairs(pairs)]
+    else:
+        found = [*_bin(pairs), *_plain_sort(pairs), _gather(pairs), *_plain_pairs(pairs)]
+    return [*found, *pairs.pruning.begin()] if pairs.pruning is not None else found
+
+
+def _listed(pairs: NeighborList) -> tuple[Any, Any, Any, Any]:
+    """Starts by owner, owners, partners and images: of the wide list where there is one."""
+    wide = pairs.pruning
+    if wide is not None:
+        return wide.wide_start, wide.wide_i, wide.wide_j, wide.wide_image
+    return pairs.out_start, pairs.pair_i, pairs.pair_j, pairs.pair_image
 
 
 def _launch(
@@ -132,8 +142,8 @@ def _native_sort(pairs: NeighborList) -> Launch:
 def _native_pairs(pairs: NeighborList) -> Launches:
     model, state, workers = pairs.model, pairs.state, pairs.workers
     found = (pairs.row_i, pairs.row_j, pairs.row_image)
-    listed = (pairs.pair_i, pairs.pair_j, pairs.pair_image)
-    return [
+    out_start, *listed = _listed(pairs)
+    search = [
         _launch(
             pairs,
             "search_pairs",
@@ -184,23 +194,26 @@ def _native_pairs(pairs: NeighborList) -> Launches:
             pairs.found_count,
             *found,
             state.status,
-            pairs.out_start,
+            out_start,
             pairs.pair_slot,
             *listed,
         ),
-        _launch(
-            pairs,
-            "index_partners",
-            workers,
-            workers,
-            model.segment_count,
-            state.status,
-            pairs.pair_j,
-            pairs.in_start,
-            pairs.in_pair,
-            state.status[PAIR_COUNT : PAIR_COUNT + 1],
-        ),
     ]
+    if pairs.pruning is not None:
+        return search
+    index = _launch(
+        pairs,
+        "index_partners",
+        workers,
+        workers,
+        model.segment_count,
+        state.status,
+        pairs.pair_j,
+        pairs.in_start,
+        pairs.in_pair,
+        state.status[PAIR_COUNT : PAIR_COUNT + 1],
+    )
+    return [*search, index]
 
 
 # -- everywhere: padded rows and radix sorts ------------------------------------------------------
@@ -233,11 +246,12 @@ def _plain_pairs(pairs: NeighborList) -> Launches:
     count, capacity, segments = pairs.piece_count, pairs.pair_capacity, model.segment_count
     rows = (pairs.row_i, pairs.row_j, pairs.row_image)
     status = state.status
+    out_start, *listed = _listed(pairs)
 
     def scan() -> None:
         wp.utils.array_scan(pairs.row_count, pairs.row_end, inclusive=True)
 
-    return [
+    search = [
         _launch(
             pairs,
             "find_pairs",
@@ -292,22 +306,22 @@ def _plain_pairs(pairs: NeighborList) -> Launches:
             split=False,
         ),
         _sort(pairs.pair_key, pairs.pair_slot, capacity, segments),
-        _starts(pairs, pairs.pair_key, status, PAIR_COUNT, segments, pairs.out_start),
+        _starts(pairs, pairs.pair_key, status, PAIR_COUNT, segments, out_start),
         _launch(
             pairs,
             "fetch_pairs",
             segments,
-            pairs.out_start,
+            out_start,
             pairs.pair_slot,
             pairs.found_j,
             pairs.found_image,
             status,
-            pairs.pair_i,
-            pairs.pair_j,
-            pairs.pair_image,
+            *listed,
             pairs.in_key,
             split=False,
         ),
-        _sort(pairs.in_key, pairs.in_pair, capacity, segments),
-        _starts(pairs, pairs.in_key, status, PAIR_COUNT, segments, pairs.in_start),
     ]
+    if pairs.pruning is not None:
+        return search
+    index = _starts(pairs, pairs.in_key, status, PAIR_COUNT, segments, pairs.in_start)
+    return [*search, _sort(pairs.in_key, pairs.in_pair, capacity, segments), index]

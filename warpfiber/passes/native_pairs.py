@@ -32,11 +32,14 @@ from warpfiber.passes.precision import group_struct
 BLOCK = 64  # pairs whose answers fit into the bits of one integer
 LANES = 8  # pairs in one vector: as fast as 16 in float32, 15 % faster than 4 in float64
 CHUNK_SEGMENTS = 64  # segments per launch index: workers share blocks in such portions
+CLEAR_ACTS = "__builtin_memset(pair_acts.data + first, 0, count);"
+FETCH_RESULT = "__builtin_prefetch((real*)pair_force.data + 3 * (long long)k, 1);"
 
 # Rows (x, y, z, unused) of the pairs are loaded as they lie in memory and transposed to one
 # vector per component. The second row of a segment is read from its end, so that nothing behind
 # the last node is touched. Arguments as of `pair_block` below.
 NEAR_PAIRS = Template("""
+    $head
     typedef $real real;
     typedef real row_t __attribute__((ext_vector_type(4)));
     typedef real lane_t __attribute__((ext_vector_type($lanes)));
@@ -108,7 +111,7 @@ NEAR_PAIRS = Template("""
             const real* j = nodes + 3 * (long long)segment[pair_j.data[k]];
             __builtin_prefetch(j);
             __builtin_prefetch(j + 5);
-            __builtin_prefetch((real*)pair_force.data + 3 * (long long)k, 1);
+            $fetch_result
             if (k + 2 * 64 < capacity) __builtin_prefetch(segment + pair_j.data[k + 2 * 64]);
         }
     }
@@ -136,7 +139,6 @@ NEAR_PAIRS = Template("""
         near &= (1ull << count) - 1;
         touch &= near;
     }
-    __builtin_memset(pair_acts.data + first, 0, count);
     $rest
 """)
 # an image of the partner is rare, and in periodic boxes only
@@ -149,6 +151,25 @@ SHIFT = """if (pair_image.data[k] != none) {
 def native_chunks(segment_count: int) -> int:
     """Launch dimension of the native sweep; every index takes an equal share of the blocks."""
     return max(1, segment_count // CHUNK_SEGMENTS)
+
+
+def near_text(name: str, periodic: bool, *, head: str = "", fetch: str = "", rest: str) -> str:
+    """Statements that find the near ones of a block of pairs, up to what `rest` does with them."""
+    return NEAR_PAIRS.substitute(
+        real={"float32": "float", "float64": "double"}[name],
+        lanes=LANES,
+        none=NO_IMAGE,
+        bits=IMAGE_BITS,
+        mask=(1 << IMAGE_BITS) - 1,
+        half=1 << (IMAGE_BITS - 1),
+        shift=SHIFT if periodic else "",
+        prefetch_nodes=PREFETCH_NODES,
+        tiny="1.0e-30",
+        eps=precision(name).eps,
+        head=head,
+        fetch_result=fetch,
+        rest=rest,
+    )
 
 
 @cache
@@ -164,19 +185,7 @@ def make_pair_block(name: str, features: PairFeatures):
     rest = "return near;"
     if features.lubrication != "none":
         rest = squeeze_text(name, LANES, features.lubrication, features.sheared)
-    snippet = NEAR_PAIRS.substitute(
-        real={"float32": "float", "float64": "double"}[name],
-        lanes=LANES,
-        none=NO_IMAGE,
-        bits=IMAGE_BITS,
-        mask=(1 << IMAGE_BITS) - 1,
-        half=1 << (IMAGE_BITS - 1),
-        shift=SHIFT if features.periodic else "",
-        prefetch_nodes=PREFETCH_NODES,
-        tiny="1.0e-30",
-        eps=p.eps,
-        rest=rest,
-    )
+    snippet = near_text(name, features.periodic, fetch=FETCH_RESULT, rest=f"{CLEAR_ACTS} {rest}")
 
     @wp.func_native(snippet)
     def pair_block(

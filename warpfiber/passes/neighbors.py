@@ -44,6 +44,7 @@ from warpfiber.passes.native_search import make_search_kernels
 from warpfiber.passes.native_sort import make_sort_kernels
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pieces import piece_counts
+from warpfiber.passes.pruning import Pruning
 from warpfiber.passes.rows import make_row_kernels
 
 FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
@@ -61,6 +62,9 @@ class NeighborList:
     extension) and `skin_out` (reach + skin, skin, extension) are read by kernels, so these may
     change between builds. Segments are listed as if longer by the extension at each end: what
     slides along itself uses up that before the skin.
+
+    With `flow_origin` the pairs are pruned from a wider list (`pruning`): a build makes that one
+    and prunes it, `prune` alone the arrays above.
     """
 
     def __init__(
@@ -76,6 +80,7 @@ class NeighborList:
         pair_capacity: int | None = None,
         workers: int = 1,
         native: bool | None = None,
+        flow_origin: np.ndarray | None = None,
     ) -> None:
         self.model, self.state = model, state
         self.reach, self.skin = reach, skin
@@ -91,6 +96,7 @@ class NeighborList:
         self.build_count = 0
         self.grow_count = 0
         self._executor: Executor | None = None
+        self.pruning: Pruning | None = None
         self._cut_into_pieces()
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
@@ -104,6 +110,9 @@ class NeighborList:
             self.kernels |= make_sort_kernels(module)
         else:
             self.kernels = make_cell_kernels(name, features) | make_row_kernels(name, features)
+        if flow_origin is not None:
+            self.pruning = Pruning(self, flow_origin)
+            self.kernels |= self.pruning.kernels
         self._allocate_cells()
         self._allocate_rows()
         self._allocate_pairs()
@@ -149,16 +158,23 @@ class NeighborList:
     def cell_width(self) -> float:
         """Width that holds a segment, its reach and the skin."""
         longest = self.stretch_allowed * self.longest_rest + 2.0 * self.extension
-        return longest + self.reach + self.skin
+        return longest + self.reach + self.skin + self.margin
+
+    @property
+    def margin(self) -> float:
+        """What the wide list holds beyond the skin; 0 without one."""
+        return self.pruning.margin if self.pruning is not None else 0.0
 
     def set_stretch(self, stretch: float) -> None:
         """Cells that hold segments of this many rest lengths, from the next build on."""
         self.stretch_allowed = stretch
         self._write_sizes()
 
-    def set_skin(self, skin: float) -> None:
-        """Another skin, from the next build on."""
+    def set_skin(self, skin: float, margin: float = 0.0) -> None:
+        """Another skin, and margin of the wide list, from the next build on."""
         self.skin = skin
+        if self.pruning is not None:
+            self.pruning.margin = margin
         self._write_sizes()
 
     def set_extension(self, extension: float) -> None:
@@ -167,11 +183,13 @@ class NeighborList:
         self._write_sizes()
 
     def _write_sizes(self) -> None:
-        extent, extension = self.reach + self.skin, self.extension
+        extent, extension = self.reach + self.skin + self.margin, self.extension
         longest = self.stretch_allowed * self.longest_piece + 2.0 * extension / self.fewest_pieces
         self.sizes.assign(np.asarray([extent, longest, extension]))
-        told = np.asarray([extent, self.skin, extension])
+        told = np.asarray([self.reach + self.skin, self.skin, extension])
         self.skin_out.assign(told.astype(self.model.precision.numpy))
+        if self.pruning is not None:
+            self.pruning.write_sizes()
 
     # -- arrays -----------------------------------------------------------------------------------
 
@@ -233,6 +251,8 @@ class NeighborList:
             self.pair_key, self.pair_slot = self._int(2 * size), self._int(2 * size)
             self.in_key, self.in_pair = self._int(2 * size), self._int(2 * size)
             self.found_j, self.found_image = self._int(size), self._int(size)
+        if self.pruning is not None:
+            self.pruning.allocate(size)
         self._drop_executor()
 
     def _drop_executor(self) -> None:
@@ -243,6 +263,8 @@ class NeighborList:
     def close(self) -> None:
         """End the extra worker threads."""
         self._drop_executor()
+        if self.pruning is not None:
+            self.pruning.close()
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -250,6 +272,12 @@ class NeighborList:
     def pair_count(self) -> int:
         """Number of listed pairs."""
         return int(self.state.status.numpy()[PAIR_COUNT])
+
+    @property
+    def kept_count(self) -> int:
+        """Number of pairs that the last search kept: those of the wide list where there is one."""
+        wide = self.pruning
+        return self.pair_count if wide is None else int(wide.wide_total.numpy()[0])
 
     def host_pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Owner, partner and image code of every listed pair, as NumPy copies."""
@@ -286,6 +314,8 @@ class NeighborList:
             lost = self._lost_fiber() if overflow or stretched else None
             if overflow == 0 and (not stretched or lost is not None):
                 self.build_count += 1  # a torn fiber is reported by the next step
+                if self.pruning is not None:
+                    self.pruning.prune()
                 return replaced
             if lost is not None:
                 words = status.copy()

@@ -1,0 +1,257 @@
+"""A wide list of pairs from which the list of the next steps is pruned, several times.
+
+The wide list holds what is within reach + skin + margin of its build. From it the pairs within
+reach + skin of the present positions are kept in order, again whenever the skin is used up, for as
+long as the margin lasts: sweeps look at the few pairs of a thin skin, and cells are searched as
+seldom as for a thick one.
+
+Source: dual pair list with pruning (Pall et al. 2020, J. Chem. Phys. 153, 134110); that the wide
+    list still holds all of reach + skin is the skin test of `nodes.skin_limit` with the margin in
+    place of the skin: 2 max|u| + (1 - sigma_min(F)) h_wide <= margin.
+Symbols: F deformation since the wide list was built, u motion beside it, h_wide = reach + skin +
+    margin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warpfiber.model import PAIR_COUNT
+from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native_pairs import BLOCK
+from warpfiber.passes.prune_kernels import make_native_prune, make_plain_prune, make_wide_kernels
+
+if TYPE_CHECKING:
+    from warpfiber.passes.neighbors import NeighborList
+
+
+class Pruning:
+    """The wide list of a NeighborList, and what keeps the pairs of its public arrays from it.
+
+    `margin` beyond the skin (run units) may change between builds.
+    """
+
+    def __init__(self, pairs: NeighborList, flow_origin: np.ndarray) -> None:
+        model, state = pairs.model, pairs.state
+        p, device = model.precision, model.device
+        self.pairs, self.flow_origin = pairs, flow_origin
+        self.margin = 0.0
+        self.count = 0
+        module = kernel_module("prune", p.name, model.domain.periodic, pairs.native)
+        self.kernels = make_wide_kernels(p.name, module)
+        periodic = any(model.domain.periodic)
+        if pairs.native:
+            self.kernels |= make_native_prune(p.name, periodic, module)
+            self.kernels |= {"index_partners": pairs.kernels["index_partners"]}
+        else:
+            self.kernels |= make_plain_prune(p.name, periodic)
+            self.kernels |= {"mark_starts": pairs.kernels["mark_starts"]}
+        self.wide_sizes = wp.zeros(2, dtype=p.real, device=device)
+        self.wide_pos = wp.clone(state.node_pos)
+        self.wide_lattice = wp.clone(state.lattice)
+        self.wide_deformation = wp.clone(state.deformation)
+        self.wide_total = wp.zeros(1, dtype=wp.int32, device=device)
+        self.wide_start = wp.zeros(model.segment_count + 1, dtype=wp.int32, device=device)
+        self.short = wp.zeros(1, dtype=wp.int32, device=device)
+        self.lattice = wp.zeros(1, dtype=p.mat33, device=device)
+        self.affine = wp.zeros(1, dtype=p.mat33, device=device)
+        self.limit = wp.zeros(1, dtype=p.real, device=device)
+        self._tests: Executor | None = None
+        self._prunes: Executor | None = None
+
+    def allocate(self, size: int) -> None:
+        """Room for as many listed pairs."""
+        device = self.pairs.model.device
+
+        def put(count: int, kind: Any = wp.int32) -> Any:
+            return wp.zeros(count, dtype=kind, device=device)
+
+        self.wide_i, self.wide_j, self.wide_image = put(size), put(size), put(size)
+        if self.pairs.native:
+            self.near_bits = put(math.ceil(size / BLOCK), wp.uint64)
+            self.kept = put(self.pairs.workers)
+        else:
+            self.near, self.near_end = put(size), put(size)
+        self.close()
+
+    def close(self) -> None:
+        """End the extra worker threads."""
+        for executor in (self._tests, self._prunes):
+            if executor is not None:
+                executor.close()
+        self._tests = self._prunes = None
+
+    def write_sizes(self) -> None:
+        """Tell the kernels what the next wide list holds."""
+        wide = self.pairs.reach + self.pairs.skin + self.margin
+        told = np.asarray([wide, self.margin])
+        self.wide_sizes.assign(told.astype(self.pairs.model.precision.numpy))
+
+    # -- what is saved ----------------------------------------------------------------------------
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next wide list, and the next pruning of this one, depend on."""
+        return {
+            "wide_pos": self.wide_pos.numpy().copy(),
+            "wide_lattice": self.wide_lattice.numpy().copy(),
+            "wide_deformation": self.wide_deformation.numpy().copy(),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Prune again as the saved run did, at the positions and the lattice of the State."""
+        state = self.pairs.state
+        state.deformation.assign(np.eye(3)[None])
+        self.wide_deformation.assign(arrays["wide_deformation"])
+        self.prune()
+
+    # -- running ----------------------------------------------------------------------------------
+
+    def holds(self) -> bool:
+        """Whether the wide list still has every pair within reach and skin."""
+        if self._tests is None:
+            pairs = self.pairs
+            self._tests = Executor(
+                self._test_launches(), pairs.model.device, pairs.workers, single=True
+            )
+        self._tests.run(1, _never)
+        return not bool(self.short.numpy()[0])
+
+    def prune(self) -> None:
+        """Keep the pairs of the present positions."""
+        if self._prunes is None:
+            pairs = self.pairs
+            self._prunes = Executor(
+                self._prune_launches(), pairs.model.device, pairs.workers, single=True
+            )
+        self._prunes.run(1, _never)
+        self.count += 1
+
+    def begin(self) -> list[Launch | Call]:
+        """Launches after those of a build."""
+        state = self.pairs.state
+        return [
+            Launch(
+                "remember_wide",
+                self.kernels["remember_wide"],
+                1,
+                [
+                    state.lattice,
+                    state.status,
+                    self.wide_lattice,
+                    self.wide_deformation,
+                    self.wide_total,
+                ],
+            ),
+            self._remember(self.wide_pos),
+        ]
+
+    def _remember(self, into: Any) -> Launch:
+        count, state = self.pairs.model.node_count, self.pairs.state
+        kernel = self.kernels["remember_nodes"]
+        return Launch("remember_nodes", kernel, count, [state.node_pos, into], split=True)
+
+    def _test_launches(self) -> list[Launch | Call]:
+        model, state = self.pairs.model, self.pairs.state
+        return [
+            Launch(
+                "begin_test",
+                self.kernels["begin_test"],
+                1,
+                [
+                    self.wide_sizes,
+                    state.deformation,
+                    self.wide_deformation,
+                    self.affine,
+                    self.limit,
+                    self.short,
+                ],
+            ),
+            Launch(
+                "test_wide",
+                self.kernels["test_wide"],
+                model.node_count,
+                [
+                    model.precision.vec3(*self.flow_origin),
+                    self.affine,
+                    self.limit,
+                    self.wide_pos,
+                    state.node_pos,
+                    self.short,
+                ],
+                split=True,
+            ),
+        ]
+
+    def _prune_launches(self) -> list[Launch | Call]:
+        state = self.pairs.state
+        begin = Launch(
+            "begin_prune",
+            self.kernels["begin_prune"],
+            1,
+            [
+                state.lattice,
+                state.list_lattice,
+                self.lattice,
+                state.deformation,
+                self.wide_deformation,
+                state.status,
+            ],
+        )
+        keep = self._native_launches() if self.pairs.native else self._plain_launches()
+        return [begin, self._remember(state.list_pos), *keep]
+
+    def _native_launches(self) -> list[Launch | Call]:
+        pairs, model, state = self.pairs, self.pairs.model, self.pairs.state
+        workers, wide = pairs.workers, (self.wide_i, self.wide_j, self.wide_image)
+        mark = [pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
+        keep = [model.segment_count, self.wide_total, self.near_bits, self.kept, *wide]
+        listed = [pairs.pair_i, pairs.pair_j, pairs.pair_image]
+        partners = [model.segment_count, state.status, pairs.pair_j, pairs.in_start, pairs.in_pair]
+        total = state.status[PAIR_COUNT : PAIR_COUNT + 1]
+        inputs = {
+            "mark_near": [*mark, state.node_pos, self.near_bits, self.kept],
+            "keep_near": [*keep, pairs.out_start, *listed, state.status],
+            "index_partners": [*partners, total],
+        }
+        return [
+            Launch(name, self.kernels[name], workers, [workers, *values], split=True)
+            for name, values in inputs.items()
+        ]
+
+    def _plain_launches(self) -> list[Launch | Call]:
+        pairs, model, state = self.pairs, self.pairs.model, self.pairs.state
+        size, segments = pairs.pair_capacity, model.segment_count
+        wide = (self.wide_i, self.wide_j, self.wide_image)
+        bits = max(1, math.ceil(math.log2(segments + 1)))
+
+        def scan() -> None:
+            wp.utils.array_scan(self.near, self.near_end, inclusive=True)
+
+        def sort() -> None:
+            wp.utils.radix_sort_pairs(pairs.in_key, pairs.in_pair, size, 0, bits)
+
+        mark = [pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
+        listed = [pairs.pair_i, pairs.pair_j, pairs.pair_image, pairs.in_key, pairs.in_pair]
+        starts = [state.status, PAIR_COUNT, segments]
+        inputs = {
+            "mark_near": (size, [*mark, state.node_pos, self.near]),
+            "keep_near": (size, [segments, self.near, self.near_end, *wide, *listed, state.status]),
+            "out_start": (size + 1, [*starts, pairs.pair_i, pairs.out_start]),
+            "in_start": (size + 1, [*starts, pairs.in_key, pairs.in_start]),
+        }
+        mark_near, keep_near, out_start, in_start = (
+            Launch(name, self.kernels.get(name, pairs.kernels["mark_starts"]), dim, values)
+            for name, (dim, values) in inputs.items()
+        )
+        calls = Call("scan", scan), Call("sort", sort)
+        return [mark_near, calls[0], keep_near, out_start, calls[1], in_start]
+
+
+def _never() -> bool:
+    return False
