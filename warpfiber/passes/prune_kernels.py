@@ -129,6 +129,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
     def near_block(
         first: wp.int32,
         count: wp.int32,
+        fetch_from: wp.int32,
         reach_bound: real,
         segment_node: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
@@ -163,6 +164,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
     def mark_near(
         offset: wp.int32,
         workers: wp.int32,
+        fetch_from: wp.int32,
         list_sizes: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
@@ -186,6 +188,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
             bits = near_block(
                 first,
                 wp.min(total - first, wp.static(BLOCK)),
+                fetch_from,
                 list_sizes[0],
                 segment_node,
                 lattice,

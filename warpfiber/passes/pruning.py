@@ -24,6 +24,7 @@ import warp as wp
 from warpfiber.model import PAIR_COUNT
 from warpfiber.passes.executor import Call, Executor, Launch
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native import PREFETCH_NODES, PREFETCH_SHARED
 from warpfiber.passes.native_pairs import BLOCK
 from warpfiber.passes.prune_kernels import make_native_prune, make_plain_prune, make_wide_kernels
 
@@ -182,7 +183,8 @@ class Pruning:
     def _native_launches(self) -> list[Launch | Call]:
         pairs, model, state = self.pairs, self.pairs.model, self.pairs.state
         workers, wide = pairs.workers, (self.wide_i, self.wide_j, self.wide_image)
-        mark = [pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
+        ahead = PREFETCH_NODES if workers == 1 else PREFETCH_SHARED
+        mark = [ahead, pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
         keep = [model.segment_count, self.wide_total, self.near_bits, self.kept, *wide]
         listed = [pairs.pair_i, pairs.pair_j, pairs.pair_image]
         partners = [model.segment_count, state.status, pairs.pair_j, pairs.in_start, pairs.in_pair]
