@@ -175,6 +175,19 @@ def test_missing_folder_is_a_fault(tmp_path: Path) -> None:
         plot_run(tmp_path / "none")
 
 
+def test_beds_are_drawn_against_fraction_and_way(tmp_path: Path) -> None:
+    """Pressure against volume fraction, stress of grips against their way; not without these."""
+    columns = ("pressure_high", "volume_fraction", "stress_zz", "grip_strain")
+    folder = _run(tmp_path / "run", columns=columns)
+    names = [path.name for path in plot_run(folder)]
+    assert names == ["pressure.png", "compression.png", "drawn.png", "cell.png"]
+    for name, along in (("compression", "volume_fraction"), ("drawn", "grip_strain")):
+        rows = _table(folder.path / "figures" / f"{name}.csv")
+        assert [float(row[along]) for row in rows] == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6])
+    lacking = _run(tmp_path / "other", columns=("pressure_high", "stress_zz"))
+    assert [path.name for path in plot_run(lacking)] == ["pressure.png", "cell.png"]
+
+
 def test_rings_are_drawn_closed() -> None:
     """Of a ring between two open fibers the first node is drawn again at its end."""
     points = np.arange(30.0).reshape(10, 3)

@@ -278,17 +278,6 @@ class ContactDual:
         kernel = make_dual_balance(name, self.law.kind, by_ends, self.module)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
 
-    def relaxation_work(self) -> list[Any]:
-        """What `native_relaxation` keeps: rows, rows by partner, and the queue of fibers."""
-        fibers, rows, device = self.model.fiber_count, self.rows.row_i.shape[0], self.model.device
-        return [
-            wp.zeros(4 * rows, dtype=self.model.precision.real, device=device),
-            wp.zeros(fibers + 2, dtype=wp.int32, device=device),
-            wp.zeros(rows, dtype=wp.int32, device=device),
-            wp.zeros(fibers, dtype=wp.uint8, device=device),
-            wp.zeros(fibers, dtype=wp.int32, device=device),
-        ]
-
     # -- what is told -----------------------------------------------------------------------------
 
     @property
