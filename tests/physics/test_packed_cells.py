@@ -97,6 +97,32 @@ def test_forces_of_a_step_that_is_kept_stay(packed: Simulation) -> None:
     assert np.abs(kept - expected).max() < 100.0 * eps * np.abs(expected).max()
 
 
+def test_free_ends_near_a_fiber_have_rows(packed: Simulation) -> None:
+    """Every fiber less than 1.5 radii from a free end at the start of the step, by brute force."""
+    host, radius = packed.model.host, packed.model.group_rows[0]["radius"]
+    method = packed.method
+    nodes = method.node_back.numpy().astype(float)  # type: ignore[attr-defined]
+    fiber, first = host["segment_fiber"], host["segment_node"]
+    start, span = nodes[first], nodes[first + 1] - nodes[first]
+    box = np.asarray(packed.model.domain.size)
+    rows = last_rows(packed)
+    met = {
+        frozenset((fiber[i], fiber[j])) for i, j in zip(rows["i"], rows["j"], strict=True) if j >= 0
+    }
+    near = set()
+    turns = [np.array([u, v, 0.0]) * box for u in (-1, 0, 1) for v in (-1, 0, 1)]
+    begin = host["fiber_node_start"]
+    for f, (low, high) in enumerate(zip(begin, begin[1:], strict=False)):
+        for end in (nodes[low], nodes[high - 1]):
+            for turn in turns:
+                apart = end + turn - start
+                s = np.clip((apart * span).sum(1) / (span**2).sum(1), 0.0, 1.0)
+                gap = np.linalg.norm(apart - s[:, None] * span, axis=1) - 2.0 * radius
+                near |= {frozenset((f, k)) for k in fiber[gap < 1.5 * radius] if k != f}
+    assert len(near) > 20
+    assert near <= met
+
+
 def test_packed_cell_moves_by_whole_steps() -> None:
     """900 fibers as bent as in the whole plate: few steps are halved, and soon hardly any.
 
