@@ -22,10 +22,15 @@ DT = 0.05
 
 
 def packed_scene(
-    longest: float = 1e-3, averages: tuple[float, float] = (4e-4, 5.3e-4), **numerics: Any
+    longest: float = 1e-3,
+    averages: tuple[float, float] = (4e-4, 5.3e-4),
+    *,
+    height: float | None = None,
+    shortest: float = 1e-4,
+    **numerics: Any,
 ) -> Any:
     """Glass in a melt, in layers of a plate: 160 fibers that random straight ones cannot be."""
-    side, height = 1.1 * longest, 0.2 * longest
+    side, height = 1.1 * longest, 0.2 * longest if height is None else height
     return scene_from_dict(
         {
             "seed": 3,
@@ -40,7 +45,7 @@ def packed_scene(
                         "number_average": averages[0],
                         "weight_average": averages[1],
                         "maximum": longest,
-                        "minimum": 1e-4,
+                        "minimum": shortest,
                     },
                     "volume_fraction": 0.0793,
                     "orientation": [0.36, 0.62, 0.02, 0, 0, 0],
@@ -165,3 +170,14 @@ def test_continued_cell_is_the_same() -> None:
     assert again.node_pos.tobytes() == first.node_pos.tobytes()
     for sim in (first, again):
         sim.close()
+
+
+def test_a_step_that_tears_a_fiber_is_taken_by_halves() -> None:
+    """979 fibers, one of which contact forces would throw to twice its length in one step."""
+    averages, tolerance = (4.15e-4, 7.65e-4), 1e-2
+    scene = packed_scene(2e-3, averages, height=3e-4, shortest=5e-5, contact_tolerance=tolerance)
+    sim = Simulation(scene, workers=1)
+    sim.run(until=1.5)
+    assert rejected(sim) > 0
+    assert sim.method._segment_stretch().max() < 1.1
+    sim.close()
