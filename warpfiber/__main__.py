@@ -17,7 +17,10 @@ from warpfiber.scene import Fault, SceneError, load_scene, parse_override
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="warpfiber", description="Cells of very many flexible fibers, on CPU and CUDA."
+        prog="warpfiber",
+        description="Cells of very many flexible fibers, on CPU and CUDA.",
+        epilog="Exit codes: 0 finished, 2 a fault in the input, 3 diverged or a limit reached, 4 a "
+        "file error, 130 Ctrl-C, 143 SIGTERM or wall limit.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -51,16 +54,30 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("result", help="result folder or its run.vtkhdf")
     plot = add("plot", "Draw the figures of one run, or of several in the same axes.")
     plot.add_argument("folders", nargs="+", help="result folders")
-    plot.add_argument("--out", metavar="DIR", help="folder of the pictures")
+    plot.add_argument(
+        "--out", metavar="DIR", help="folder of the pictures (default figures/ of the first)"
+    )
     plot.add_argument("--exact", action="store_true", help="with the orientation without contact")
     export = add("export", "Write a run in another format.")
     export.add_argument("format", choices=["usd"])
     export.add_argument("result", help="result folder or its run.vtkhdf")
     export.add_argument("--out", metavar="FILE", help=".usdc, .usda or .usd")
-    export.add_argument("--frames", type=_frames, metavar="A:B:S", help="which frames")
-    export.add_argument("--wrap", choices=["none", "fiber", "split"], default="fiber")
+    export.add_argument(
+        "--frames", type=_frames, metavar="A:B:S", help="first:last:step, as a slice"
+    )
+    export.add_argument(
+        "--wrap",
+        choices=["none", "fiber", "split"],
+        default="fiber",
+        help="fibers as they moved, each back in the box, or cut at its faces (default fiber)",
+    )
     export.add_argument("--smooth", action="store_true", help="cubic curves through the nodes")
-    export.add_argument("--color", choices=["orientation", "group"], default="orientation")
+    export.add_argument(
+        "--color",
+        choices=["orientation", "group"],
+        default="orientation",
+        help="of the fibers: by direction (default) or by group",
+    )
     fit = add("fit", "Fit orientation models to a run; write constants and a figure into it.")
     fit.add_argument("result", help="result folder or its run.vtkhdf")
     fit.add_argument(
@@ -69,11 +86,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODEL",
         help="folgar_tucker, rsc, iard (these by default), pard, mrd; may be repeated",
     )
-    fit.add_argument("--closure", default="IBOF", help="as in fiberoripy (default IBOF), or NONE")
+    fit.add_argument(
+        "--closure",
+        default="IBOF",
+        help="as in fiberoripy (default IBOF), or NONE: exact, folgar_tucker alone",
+    )
     fit.add_argument("--weighting", default="length", help="length (default) or number")
     fit.add_argument("--from", type=float, dest="low", metavar="S", help="first strain")
     fit.add_argument("--to", type=float, dest="high", metavar="S", help="last strain")
-    fit.add_argument("--noise", type=_seconds, default=0.005, help="of a component, for chi2")
+    fit.add_argument(
+        "--noise", type=_seconds, default=0.005, help="standard deviation of a component, for chi2"
+    )
     return parser
 
 

@@ -18,7 +18,7 @@ from warpfiber.placement.bingham import bingham_exponents, bingham_moments, draw
 from warpfiber.placement.orientations import draw_directions, orientation_tensor
 from warpfiber.placement.populations import populations
 from warpfiber.scene import scene_from_dict
-from warpfiber.scene.statistics import smallest_eigenvalue
+from warpfiber.scene.statistics import FLATTEST, smallest_eigenvalue
 
 TARGETS = [
     (0.36, 0.59, 0.05),
@@ -101,6 +101,35 @@ def test_draws_have_second_and_fourth_moments(eigen: tuple[float, float, float])
         for got, wanted in ((p[:, i] ** 2, second[i]), (p[:, i] ** 4, fourth[i, i])):
             assert abs(np.mean(got) - wanted) < 5 * np.std(got) / np.sqrt(count)
     assert np.max(np.abs(p.mean(axis=0))) < 5 / np.sqrt(count)
+
+
+def test_what_is_flatter_than_resolved_is_as_flat_as_that() -> None:
+    """Targets may be corrected below the least eigenvalue that a scene may ask for."""
+    asked = np.array([1e-9, 0.4, 0.6])
+    nearest = np.array([FLATTEST, 0.4, 0.6])
+    np.testing.assert_array_equal(bingham_exponents(asked), bingham_exponents(nearest))
+
+
+class Doubting:
+    """Draws that take a direction only where its chance is more than one."""
+
+    def __init__(self) -> None:
+        self.rng, self.left = np.random.default_rng(5), 20
+
+    def standard_normal(self, shape: tuple[int, ...]) -> np.ndarray:
+        self.left -= 1
+        if not self.left:
+            raise TimeoutError
+        return self.rng.standard_normal(shape)
+
+    def random(self, count: int) -> np.ndarray:
+        return np.full(count, 1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("eigen", [*TARGETS, (0.4, 0.6)])
+def test_no_direction_has_a_chance_above_one(eigen: tuple[float, ...]) -> None:
+    with pytest.raises(TimeoutError):
+        draw_bingham(np.array(eigen), 1000, Doubting())  # type: ignore[arg-type]
 
 
 def test_laws_differ_and_turn_with_the_tensor() -> None:

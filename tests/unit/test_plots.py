@@ -14,6 +14,7 @@ pytest.importorskip("matplotlib")
 from matplotlib.image import imread  # noqa: E402
 
 from warpfiber.output.cell import closed_lines  # noqa: E402
+from warpfiber.output.curves import GREEN, ORANGE  # noqa: E402
 from warpfiber.output.folder import ResultFolder  # noqa: E402
 from warpfiber.output.plots import plot_run  # noqa: E402
 from warpfiber.output.scalars import ScalarsWriter  # noqa: E402
@@ -119,6 +120,18 @@ def test_several_runs_share_axes(tmp_path: Path) -> None:
     assert {row["run"] for row in _table(tmp_path / "both" / "orientation.csv")} == {"a", "b"}
 
 
+def test_a_curve_under_another_is_seen(tmp_path: Path) -> None:
+    """Contacts and touching fibers are the same of rods: the lower line is drawn wider."""
+    from matplotlib.colors import to_rgb
+
+    columns = ("contacts_per_fiber", "coordination_number")
+    folder = _run(tmp_path / "r", columns=columns)
+    (picture,) = [path for path in plot_run(folder) if path.stem == "interactions"]
+    shown = imread(picture)[:, :850, :3]  # without the words beside the axes
+    seen = [int((np.abs(shown - to_rgb(c)).max(axis=2) < 0.02).sum()) for c in (ORANGE, GREEN)]
+    assert min(seen) > 500
+
+
 def test_references_beside_the_scene_are_drawn(tmp_path: Path) -> None:
     (tmp_path / "reference").mkdir()
     (tmp_path / "reference" / "cell_figure_7.csv").write_text(
@@ -160,6 +173,19 @@ def test_single_fiber_without_box(tmp_path: Path) -> None:
 def test_missing_folder_is_a_fault(tmp_path: Path) -> None:
     with pytest.raises(SceneError):
         plot_run(tmp_path / "none")
+
+
+def test_beds_are_drawn_against_fraction_and_way(tmp_path: Path) -> None:
+    """Pressure against volume fraction, stress of grips against their way; not without these."""
+    columns = ("pressure_high", "volume_fraction", "stress_zz", "grip_strain")
+    folder = _run(tmp_path / "run", columns=columns)
+    names = [path.name for path in plot_run(folder)]
+    assert names == ["pressure.png", "compression.png", "drawn.png", "cell.png"]
+    for name, along in (("compression", "volume_fraction"), ("drawn", "grip_strain")):
+        rows = _table(folder.path / "figures" / f"{name}.csv")
+        assert [float(row[along]) for row in rows] == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6])
+    lacking = _run(tmp_path / "other", columns=("pressure_high", "stress_zz"))
+    assert [path.name for path in plot_run(lacking)] == ["pressure.png", "cell.png"]
 
 
 def test_rings_are_drawn_closed() -> None:

@@ -189,6 +189,15 @@ def test_any_step_is_taken() -> None:
     assert p[2] / p[0] == pytest.approx(expected, rel=1e-9)
 
 
+def test_a_step_beyond_contact_is_refused() -> None:
+    """Fibers would pass through each other in larger ones, or be tried in ever smaller steps."""
+    keys = {"numerics__method": "rigid_rod", "numerics__segments": 1}
+    keys |= {"contact__law": "exponential", "numerics__strain_step": 0.3}
+    with pytest.raises(wf.SceneError, match=r"numerics\.dt .*contact: a strain of 0\.2"):
+        wf.Simulation(read(ROD, **keys))
+    wf.Simulation(read(ROD, numerics__allow_unstable_dt=True, **keys)).close()
+
+
 def test_nodes_from_a_file(tmp_path: Path) -> None:
     """Two nodes are a rod; more are refused before anything is written."""
     ends = np.array([[[0.0, 0, 0], [9e-5, 0, 0]], [[0.0, 5e-5, 0], [0, 1.4e-4, 0]]])

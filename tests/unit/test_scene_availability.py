@@ -8,6 +8,7 @@ import pytest
 
 from tests.scene_text import GONE, changed, faults_of
 from warpfiber.scene import scene_from_dict
+from warpfiber.scene.availability import unavailable
 
 BONDED_SPHERES = """
 [box]
@@ -67,11 +68,16 @@ NOT_YET: list[tuple[dict[str, object], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "key"), NOT_YET)
-def test_known_but_not_in_this_version(changes: dict[str, object], key: str) -> None:
-    """Keys of later versions are known, and told to be not available with an alternative."""
+def test_known_but_not_available(changes: dict[str, object], key: str) -> None:
+    """Keys of later versions, or of other methods, are known; an alternative is told."""
     faults = faults_of(changed(changes))
     assert [fault.key for fault in faults] == [key], [str(fault) for fault in faults]
-    assert "not available in this version; " in faults[0].remedy
+    table, _, name = key.rpartition(".")
+    value = changes.get(key)
+    value = tuple(value) if isinstance(value, list) else value
+    of_none = unavailable(table.split(".")[0], name, value)
+    where = "this version" if of_none else "method bead_chain"
+    assert f"not available in {where}; " in faults[0].remedy
 
 
 OVERDAMPED: dict[str, object] = {

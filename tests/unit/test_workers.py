@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -127,3 +128,21 @@ def test_core_given_away() -> None:
     executor.run(3, lambda: False)
     executor.close()
     np.testing.assert_array_equal(a.numpy(), _expected(start, 6))
+
+
+def test_threads_are_shared() -> None:
+    """Two that are open have one crew; the second goes on when the first ends, both end it."""
+    before = set(threading.enumerate())
+    (a, b, start), (c, d, other) = _numbers(), _numbers()
+    first, second = (Executor(_launches(*pair), "cpu", 3) for pair in ((a, b), (c, d)))
+    crew = set(threading.enumerate()) - before
+    assert len(crew) == 2
+    for executor in (first, second, first):
+        executor.run(2, lambda: False)
+    first.close()
+    second.run(1, lambda: False)
+    assert all(thread.is_alive() for thread in crew)
+    second.close()
+    assert not any(thread.is_alive() for thread in crew)
+    np.testing.assert_array_equal(a.numpy(), _expected(start, 8))
+    np.testing.assert_array_equal(c.numpy(), _expected(other, 6))

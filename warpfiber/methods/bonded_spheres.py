@@ -43,7 +43,7 @@ from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.containers import container
 from warpfiber.scene.gripping import GRIPPING
-from warpfiber.scene.planes import rubs, wall_faces
+from warpfiber.scene.planes import free_planes, rubs, wall_faces
 
 NATIVE = True  # vectorized sweeps on the CPU; False runs there what CUDA runs
 
@@ -77,6 +77,7 @@ class BondedSpheres(Method):
             pairs=scene.contact.law != "none" and model.segment_count > 1,
             wall_friction=rubs(scene),
             container=container(scene) is not None,
+            planes=len(free_planes(scene)),
             press=self.press.axis,
             grips=self.grips.used,
         )
@@ -94,7 +95,7 @@ class BondedSpheres(Method):
         self.node_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.node_spin_rate = wp.zeros(nodes, dtype=p.vec3, device=device)
         self.still_steps = wp.zeros(model.fiber_count, dtype=wp.int32, device=device)
-        kept = SIDES * nodes if self.features.wall_friction else 0
+        kept = (SIDES + self.features.planes) * nodes if self.features.wall_friction else 0
         faces = np.asarray(wall_faces(scene)) / [1.0, *[model.units.velocity] * 3]
         self.wall_face = wp.array(faces.astype(p.numpy), dtype=p.vec4, device=device)
         self.wall_memory = wp.zeros(kept, dtype=p.vec3, device=device)

@@ -36,7 +36,7 @@ LARGEST_CHANGE = 1.5  # of one build
 LASTING = 1.3  # uses of a step that a skin must have room for
 # of a wide list: of a piece, of what it finds around it at the first skin, of a listed pair
 WIDE_PIECE, WIDE_NEAR, WIDE_PAIR = 64.0, 121.0, 35.0
-PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 8.0  # of a pair of the wide list, of a segment beside
+PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 12.0  # of a pair of the wide list, of a segment beside
 START_TIMES, MOST_PRUNED = 2, 12  # skins used up before cells are searched again
 UNEVEN = 1.1  # what a wide list holds more, since skins are used up unevenly
 MEMORY = 0.5  # weight of the use before in the mean
@@ -126,27 +126,34 @@ class SkinChoice:
         """ns per segment-step, with `pairs_per_segment` at the present skin."""
         per_volume = pairs_per_segment / self._listed_volume(self.skin)
         if self.pruned:
-            return min(self._pruned_cost(skin, times, per_volume) for times in self._times(skin))
+            return self._pruned_least(skin, per_volume)[0]
         pairs = per_volume * self._listed_volume(skin)
         build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * self._near(skin))
         return build / max(1.0, skin / self.use) + self.pair_cost * pairs
 
     def first_margin(self) -> float:
         """As long as nothing is known."""
-        return self._margin(self.skin, min(START_TIMES, max(self._times(self.skin))))
+        has_room = self._margin(self.skin, START_TIMES) <= self.largest - self.skin
+        return self._margin(self.skin, START_TIMES if has_room else 1)
 
     def choose_margin(self, skin: float, pairs_per_segment: float) -> float:
         """Margin of the wide list beyond this skin, with these pairs at the present one."""
         if not self.pruned or pairs_per_segment <= 0.0:
             return self.margin
         per_volume = pairs_per_segment / self._listed_volume(self.skin)
-        best = min(self._times(skin), key=lambda n: self._pruned_cost(skin, n, per_volume))
-        return self._margin(skin, best)
+        return self._margin(skin, self._pruned_least(skin, per_volume)[1])
 
-    def _times(self, skin: float) -> list[int]:
-        """How often a skin may be used up before the box is too small for the wide list."""
-        room = self.largest - skin
-        return [n for n in range(1, MOST_PRUNED + 1) if n == 1 or self._margin(skin, n) <= room]
+    def _pruned_least(self, skin: float, per_volume: float) -> tuple[float, int]:
+        """Least cost and how often the skin is then used up; one minimum, bounded by the box."""
+        least, times = math.inf, 0
+        for n in range(1, MOST_PRUNED + 1):
+            if n > 1 and self._margin(skin, n) > self.largest - skin:
+                break
+            cost = self._pruned_cost(skin, n, per_volume)
+            if cost >= least:
+                break
+            least, times = cost, n
+        return least, times
 
     @staticmethod
     def _margin(skin: float, times: int) -> float:

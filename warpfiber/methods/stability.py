@@ -189,8 +189,12 @@ def _group_limits(scene: Scene, index: int) -> list[StepLimit]:
 def step_limits(scene: Scene) -> tuple[StepLimit, ...]:
     """All limits of all groups, smallest first.
 
-    `overdamped` has none but the strain of a step, `rigid_rod` none at all.
+    `overdamped` has none but the strain of a step, `rigid_rod` none at all where nothing touches.
     """
+    meets = scene.contact.law != "none" or scene.contact.lubrication != "none"
+    if scene.numerics.method == "rigid_rod" and meets:
+        term = f"contact: a strain of {LARGEST_STRAIN}"
+        return (StepLimit(term, largest_step(scene), 0, "accurate"),)
     if scene.numerics.method == "rigid_rod":
         return (StepLimit("none: maps of the flow are exact", math.inf, 0, "accurate"),)
     if scene.numerics.method == "overdamped":

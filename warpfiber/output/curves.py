@@ -28,6 +28,7 @@ class Curves:
     ylim: tuple[float, float] | None = None
     logarithmic: bool = False
     least: float = -np.inf  # what a value must exceed for the figure to be drawn
+    along: str = ""  # the column that it is drawn against; empty: strain or time
 
 
 FIGURES = (
@@ -118,6 +119,21 @@ FIGURES = (
         "Pressure on walls",
         "pressure (Pa)",
         {"pressure_low": ("lower", ORANGE), "pressure_high": ("upper", BLUE)},
+    ),
+    Curves(
+        "compression",
+        "Pressure on the upper wall",
+        "pressure (Pa)",
+        {"pressure_high": ("", BLUE)},
+        least=0.0,
+        along="volume_fraction",
+    ),
+    Curves(
+        "drawn",
+        "Stress on the upper grip",
+        "stress (Pa)",
+        {"stress_zz": ("zz", BLUE), "stress_xz": ("xz", ORANGE)},
+        along="grip_strain",
     ),
     Curves(
         "axial_strain",

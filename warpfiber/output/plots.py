@@ -1,9 +1,10 @@
 """Figures of a run, drawn from its folder alone; each PNG lies beside a CSV with what it shows.
 
 Curves against strain (time, where nothing is strained): orientation by length and by number,
-interactions, overlap, bending, stress, energy, pressure on walls, axial strain, angle, and the tip
-of a few fibers; `cell.png` is a picture of the cell at the end. Where layers were recorded (in the
-first run) `layers*.png` go through the thickness and `cut.png` is a section there.
+interactions, overlap, bending, stress, energy, pressure on walls (also against volume fraction),
+stress on grips against their way, axial strain, angle, and the tip of a few fibers; `cell.png` is
+a picture of the cell at the end. Where layers were recorded (in the first run) `layers*.png` go
+through the thickness and `cut.png` is a section there.
 Points of `reference/*.csv` beside the scene are drawn over them: a header row with `strain` (or
 `time`) and columns named as in `scalars.csv` (`tip` for the tip); lines with # are comments.
 So is the exact orientation of the fibers without contact, where it applies or is asked for.
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 Table = dict[str, NDArray[Any]]
 TIP_FIBERS = 10  # more curves than this say nothing
+COVERS = 0.02  # curves as near as this part of their largest value in the mean look like one
 _DPI = 160
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -128,8 +130,12 @@ def _tip_curves(runs: Iterable[_Run]) -> Curves:
     return Curves("tip", "Height of the fiber tip", "$z_{\\mathrm{tip}}\\,/\\,L$", columns)
 
 
-def _abscissa(table: Mapping[str, NDArray[Any]], column: str) -> tuple[str, NDArray[Any]]:
+def _abscissa(
+    table: Mapping[str, NDArray[Any]], column: str, along: str = ""
+) -> tuple[str, NDArray[Any]]:
     """What a column is drawn against: strain, or time where the strain stays zero or is absent."""
+    if along:
+        return along, table[along]
     prefix = "tip_" if column.startswith("tip") and "tip_strain" in table else ""
     for name in ("strain", "time", "step"):
         values = table.get(prefix + name)
@@ -171,7 +177,17 @@ def _exact(run: _Run, asked: bool) -> dict[str, Table]:
 
 def _known(curves: Curves, run: _Run) -> list[str]:
     """Columns of the figure that a run has."""
+    if curves.along and not _finite(run.table, curves.along):
+        return []
     return [name for name in curves.columns if _finite(run.table, name)]
+
+
+def _is_covered(curves: Curves, run: _Run, name: str) -> bool:
+    """Whether a curve that is drawn later lies on this one and would hide it."""
+    names, y = _known(curves, run), run.table[name].astype(float)
+    least = COVERS * float(np.nanmax(np.abs(y)))
+    apart = [np.abs(run.table[other] - y) for other in names[names.index(name) + 1 :]]
+    return any(float(np.nanmean(way)) <= least for way in apart)
 
 
 def _draw_curves(
@@ -195,13 +211,14 @@ def _draw_curves(
         for run in drawn:
             if not _finite(run.table, name):
                 continue
-            against, x = _abscissa(run.table, name)
+            against, x = _abscissa(run.table, name, curves.along)
             y = run.table[name].astype(float)
             shown = np.where(y > 0, y, np.nan) if curves.logarithmic else y
             if not np.isfinite(shown).any():
                 continue
             dash = _DASHES[drawn.index(run) % len(_DASHES)]
-            axes.plot(x, shown, color=color, linestyle=dash, linewidth=1.6, zorder=3)
+            width = 4.8 if _is_covered(curves, run, name) else 1.6
+            axes.plot(x, shown, color=color, linestyle=dash, linewidth=width, zorder=3)
             known = shown[np.isfinite(shown)]
             lasts.append(np.median(known[-max(1, len(known) // 30) :]))
             rows += [[run.label, name, a, b] for a, b in zip(x, y, strict=True)]
@@ -255,7 +272,8 @@ def _dress(axes: Axes, curves: Curves, runs: Sequence[_Run], against: str) -> No
     """Title, axes, limits and the light grid."""
     scene = runs[0].scene
     strain = "shear strain" if _sheared(runs[0]) else "strain"
-    words = {"strain": strain, "time": "time (s)"}
+    words = {"strain": strain, "time": "time (s)", "volume_fraction": "volume fraction"}
+    words["grip_strain"] = "way of the grip / free height"
     axes.set_xlabel(words.get(against, against), color=INK)
     axes.set_ylabel(curves.ylabel, color=INK)
     words_of_scene = str(scene.get("title") or "")[:60] if len(runs) == 1 else ""

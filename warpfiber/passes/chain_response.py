@@ -6,6 +6,7 @@ Source: `chain_reply`, the response of one fiber; during the solve by its blocks
 from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpfiber.model import HALT, Model, precision
@@ -18,6 +19,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.native import LANES
 from warpfiber.passes.native_blocks import MOST_NODES
 from warpfiber.passes.precision import group_struct
+from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
 from warpfiber.passes.unilateral import ContactDual
 
 BLOCK_SHARE = 32
@@ -164,6 +166,7 @@ class ChainResponse:
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
     block_share: numbers per end in `block`, the ends that a fiber may have on average.
     fiber_pace: see `chain_pace`; 1 unless given.
+    parts: into which a relaxation cuts the cell; by its size unless given.
     """
 
     by_ends = True
@@ -176,10 +179,11 @@ class ChainResponse:
         tension: Any,
         block_share: int | None = None,
         fiber_pace: Any = None,
+        parts: int | None = None,
     ) -> None:
         most = max(row["segments"] for row in model.group_rows)
         self.relaxes = model.device.startswith("cpu") and most < MOST_NODES
-        self.block_share = block_share
+        self.block_share, self.parts = block_share, parts
         self.model, self.rows, self.row_stride, self.tension = model, rows, row_stride, tension
         p, nodes = model.precision, model.node_count
         ones = wp.full(model.fiber_count, p.real(1.0), p.real, device=model.device)
@@ -191,6 +195,7 @@ class ChainResponse:
         self.end_start = self._array(model.fiber_count + 1, wp.int32)
         self.block_start = self._array(model.fiber_count, wp.int32)
         self._allocate(0)
+        self.column_at = self._array(0, wp.int32)
 
     def _array(self, size: int, dtype: Any) -> Any:
         return wp.zeros(size, dtype=dtype, device=self.model.device)
@@ -287,63 +292,30 @@ class ChainResponse:
 
     def relax(self, dual: ContactDual) -> list[Launch | Call]:
         """Forces, shift and tensions of the solution."""
-        model, rows, law, p = self.model, dual.rows, dual.law, self.model.precision
-        fibers, ends = model.fiber_count, 2 * rows.row_i.shape[0]
-        nodes = 1 + max(row["segments"] for row in model.group_rows)
-        lanes = LANES[p.name]
-        if self.block_share is None:
-            # as much as there may be: what the rows of a step do not need stays out of memory
-            numbers = ends * (2 * BLOCK_SHARE + 4 * nodes)
-            numbers += lanes * (lanes * fibers + 4 * model.node_count)
-        else:
-            numbers = ends * self.block_share
-        self.block = wp.empty(min(numbers, MOST_NUMBERS), dtype=p.real, device=model.device)
-        work = [
-            self._array(REPLY_NUMBERS * len(model.group_rows), p.real),
-            self.end_start,
-            self.block_start,
-            self._array(fibers, wp.uint8),
-            self._array(ends, wp.int32),
-            self._array(ends, p.real),
-            self.block,
-            wp.empty(lanes * (ends + lanes + 4 * nodes), dtype=p.real, device=model.device),
-        ]
+        model, p = self.model, self.model.precision
+        ends, lanes = 2 * dual.rows.row_i.shape[0], LANES[p.name]
+        nodes = np.diff(model.host["fiber_node_start"])
+        sizes = -(-4 * nodes // lanes) * lanes
+        work = relaxation_work(dual, self.end_start, sizes, self.parts)
+        most, parts = int(sizes.max()), work.parts
+        # as much as there may be: what the rows of a step do not need stays out of memory
+        share = most * parts if self.block_share is None else self.block_share
+        self.block = wp.empty(min(ends * share, MOST_NUMBERS), dtype=p.real, device=model.device)
+        self.column_at = self._array(ends, wp.int32)
         inputs = [
-            fibers,
             self.row_stride,
-            dual.most,
-            wp.float64(dual.tolerance),
-            law.stiffness,
-            law.decay,
             dual.step_size,
             self.fiber_pace,
-            model.groups,
-            model.fiber_node_start,
-            model.fiber_group,
-            model.segment_node,
-            model.segment_fiber,
-            dual.fiber_frozen,
             self.rows,
-            rows.row_count,
-            rows.row_out_start,
-            rows.row_i,
-            rows.row_j,
-            rows.row_s,
-            rows.row_t,
-            rows.row_normal,
-            rows.row_base,
-            rows.row_compliance,
-            *work,
-            *dual.relaxation_work(),
-            dual.state.status,
-            rows.row_force,
-            dual.node_shift,
+            self._array(REPLY_NUMBERS * len(model.group_rows), p.real),
+            self.column_at,
+            self.block,
+            self._array(parts, wp.int64),
+            self._array(most * parts, p.real),
             self.segment_impulse,
-            dual.best,
-            dual.control,
         ]
-        kernel = make_chain_relaxation(p.name, law.kind)
-        return [Launch("chain_relax", kernel, 1, inputs)]
+        kernel = make_chain_relaxation(p.name, dual.law.kind)
+        return [*relaxation_launches(kernel, work, inputs)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
         """Moves the fibers by the solution and adds its tensions."""

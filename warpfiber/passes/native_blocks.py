@@ -1,30 +1,39 @@
 """Motion of one flexible fiber by unit forces at its ends of rows, a SIMD vector of ends at a time.
 
-A lane is an end with a unit force; the two solves of `chain_reply` run on all lanes at once. They
-leave as many columns of the block of the fiber (how far every end moves along its row) and what the
-whole fiber does: displacements of the nodes and impulses of the segments before them.
+A lane is an end with a unit force; the two solves of `chain_reply` run on all lanes at once. What
+every lane leaves is turned into a column: four numbers of every node, its displacement and the
+impulse of the segment before it.
 Symbols: as in `chain_reply`; T, W, V, U, V3 from `native.lane_types`; z displacements and b
     impulses of the nodes, `at` the node before the end, `share` the part of the force on the next.
 Limits: CPU only; fibers of up to MOST_NODES nodes (stack); sums are in another order than in
     `chain_reply` and multiplications and additions are fused: equal to rounding.
 """
 
+from warpfiber.passes.native import transpose
+
 MOST_NODES = 512
 
-# `fill(f, group, column, width, reply)`: lanes are the ends group ... group + W - 1 of fiber f;
-# end e of it moves by column[e width + lane]. `row_of(f, x)` is the row of an end, its owner first.
-FILL_BLOCK = """
-    auto fill = [&](int f, int group, T* column, int width, U* reply) {
-        const int first = fiber_node_start.data[f];
-        const int segments = fiber_node_start.data[f + 1] - first - 1;
-        const int base = row_stride * f, count = end_start.data[f + 1] - end_start.data[f];
-        const int owned = row_last(f) - row_first(f), of = fiber_group.data[f];
+
+# `fill(f, lanes, row, side, column)`: columns of the ends `side` of `row`, one behind the other,
+# of size_of(f) numbers each. `turn(v)` transposes W vectors.
+def fill_text(lanes: int) -> str:
+    """C++ text of `fill`."""
+    return FILL.replace("TURN", transpose(lanes)).replace("MOST_NODES", str(MOST_NODES))
+
+
+FILL = """
+    auto fill = [&](int f, int lanes, const int* row, const int* side, T* column)
+            __attribute__((noinline)) {
+        const int node = d.fiber_node_start.data[f];
+        const int segments = d.fiber_node_start.data[f + 1] - node - 1;
+        const int base = row_stride * f, of = d.fiber_group.data[f];
         const T* const number = numbers.data + 6 * of;
         const T pace = fiber_pace.data[f];
         const T h = pace * number[0], kappa = pace * number[1];
         const T drag_end = number[2], drag_inner = number[3];
         const T drag_off = number[4], strength = number[5];
-        const T weight = groups.data[of].weight, weight_excess = groups.data[of].weight_excess;
+        const auto& group = d.groups.data[of];
+        const T weight = group.weight, weight_excess = group.weight_excess;
         V3 z[MOST_NODES];
         V b[MOST_NODES];
         auto times = [&](const auto& row, const V3& v) -> V3 {
@@ -40,26 +49,25 @@ FILL_BLOCK = """
         const V3 none = same3(T(0), T(0), T(0));
         V at = V(T(-9)), share = V(T(0));
         V3 push = none;
-        for (int l = 0; l < W && group + l < count; ++l) {
-            const int r = row_of(f, group + l);
-            const bool own = group + l < owned;
-            const auto& n = row_normal.data[r];
-            at[l] = T(end_node(r, own) - first);
-            share[l] = own ? row_s.data[r] : row_t.data[r];
-            push.x[l] = own ? -n[0] : n[0];
-            push.y[l] = own ? -n[1] : n[1];
-            push.z[l] = own ? -n[2] : n[2];
+        for (int l = 0; l < lanes; ++l) {
+            const Row& from = rows[row[l]];
+            const bool own = side[l] == 0;
+            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
+            share[l] = own ? from.s : from.t;
+            push.x[l] = own ? -from.normal[0] : from.normal[0];
+            push.y[l] = own ? -from.normal[1] : from.normal[1];
+            push.z[l] = own ? -from.normal[2] : from.normal[2];
         }
-        for (int stage = 0; stage < 2; ++stage) {
+        for (int again = 0; again < 2; ++again) {
             V3 y1 = none, v1 = none, v2 = none, couple = none, z0 = none, z1 = none;
             V yt1 = V(T(0));
-            if (stage == 1) z1 = z[0];
+            if (again == 1) z1 = z[0];
             for (int k = 0; k <= segments; ++k) {
-                const auto& row = rows.data[base + k];
+                const auto& row = factors.data[base + k];
                 const V part = at == V(T(k)) ? T(1) - share
                     : (at == V(T(k - 1)) ? share : V(T(0)));
                 V3 r = push * (h * part);
-                if (stage == 1) {
+                if (again == 1) {
                     const T drag = k == 0 || k == segments ? drag_end : drag_inner;
                     r = r + z1 * V(drag) + z0 * V(drag_off) + couple;
                     if (k < segments) {
@@ -74,7 +82,7 @@ FILL_BLOCK = """
                 }
                 V3 y = r - V3{along(row.l0, y1), along(row.l1, y1), along(row.l2, y1)};
                 y = y - same(row.lt) * yt1 - v2 * V(kappa);
-                const V yt = k == 0 ? V(T(0)) : along(rows.data[base + k - 1].axis, v1);
+                const V yt = k == 0 ? V(T(0)) : along(factors.data[base + k - 1].axis, v1);
                 v2 = v1;
                 v1 = times(row, y) + same(row.q) * yt;
                 z[k] = v1;
@@ -85,13 +93,13 @@ FILL_BLOCK = """
             V3 behind = none, beyond = none;
             V impulse = V(T(0));
             for (int k = segments; k >= 0; --k) {
-                const auto& row = rows.data[base + k];
+                const auto& row = factors.data[base + k];
                 V3 p = none;
                 if (k < segments) p = same(row.axis) * impulse - beyond * V(kappa);
                 V3 x = z[k] + times(row, p);
                 V whole = b[k] + along(row.q, p);
                 if (k < segments) {
-                    const auto& next = rows.data[base + k + 1];
+                    const auto& next = factors.data[base + k + 1];
                     x = x - same(next.l0) * behind.x - same(next.l1) * behind.y
                         - same(next.l2) * behind.z;
                     whole = whole - along(next.lt, behind);
@@ -103,19 +111,18 @@ FILL_BLOCK = """
                 b[k] = whole;
             }
         }
-        for (int e = 0; e < count; ++e) {
-            const int r = row_of(f, e);
-            const bool own = e < owned;
-            const T t = own ? row_s.data[r] : row_t.data[r];
-            const int k = end_node(r, own) - first;
-            const V move = along(row_normal.data[r], z[k] * V(T(1) - t) + z[k + 1] * V(t));
-            *(U*)(column + (long long)e * width) = own ? -move : move;
-        }
-        for (int k = 0; k <= segments; ++k) {
-            reply[4 * k] = z[k].x;
-            reply[4 * k + 1] = z[k].y;
-            reply[4 * k + 2] = z[k].z;
-            reply[4 * k + 3] = b[k];
+        const int size = size_of(f);
+        for (int k = 0; 4 * k < size; k += W / 4) {
+            V r[W];
+            for (int n = 0; n < W / 4; ++n) {
+                const bool there = k + n <= segments;
+                r[4 * n] = there ? z[k + n].x : V(T(0));
+                r[4 * n + 1] = there ? z[k + n].y : V(T(0));
+                r[4 * n + 2] = there ? z[k + n].z : V(T(0));
+                r[4 * n + 3] = there ? b[k + n] : V(T(0));
+            }
+            TURN
+            for (int l = 0; l < lanes; ++l) *(U*)(column + (long long)l * size + 4 * k) = r[l];
         }
     };
-""".replace("MOST_NODES", str(MOST_NODES))
+"""

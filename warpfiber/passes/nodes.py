@@ -25,6 +25,12 @@ from warpfiber.passes.precision import group_struct
 
 # A segment longer than this many rest lengths is no longer a physical state but a diverging step.
 TEAR_STRETCH = 2.0
+# The second walk runs backward, which no processor foresees, and only it reads these.
+FETCH = """
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(list_pos.data + i);
+#endif
+"""
 
 
 @dataclass(frozen=True)
@@ -124,27 +130,44 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
         pair_arm_i: wp.array(dtype=vec3),
         pair_arm_j: wp.array(dtype=vec3),
     ):
-        """Total pair force on a segment and its part on the second node."""
-        total = vec3(zero, zero, zero)
-        second = vec3(zero, zero, zero)
+        """Total pair force on a segment and its part on the second node.
+
+        Summed by component: the compiler keeps numbers in registers, but not vectors that some
+        turns of a loop leave as they are.
+        """
+        fx, fy, fz = real(0.0), real(0.0), real(0.0)
+        sx, sy, sz = real(0.0), real(0.0), real(0.0)
         for k in range(out_start[segment], out_start[segment + 1]):
             if pair_acts[k] != wp.uint8(0):
                 force = pair_force[k]
-                total += force
+                fx += force[0]
+                fy += force[1]
+                fz += force[2]
                 if wp.static(has_arms):
-                    second += pair_arm_i[k]
+                    arm = pair_arm_i[k]
                 else:
-                    second += pair_closest[k][0] * force
+                    arm = pair_closest[k][0] * force
+                sx += arm[0]
+                sy += arm[1]
+                sz += arm[2]
         for slot in range(in_start[segment], in_start[segment + 1]):
             k = in_pair[slot]
             if pair_acts[k] != wp.uint8(0):
                 force = pair_force[k]
-                total -= force
+                fx -= force[0]
+                fy -= force[1]
+                fz -= force[2]
                 if wp.static(has_arms):
-                    second -= pair_arm_j[k]
+                    arm = pair_arm_j[k]
                 else:
-                    second -= pair_closest[k][1] * force
-        return total, second
+                    arm = pair_closest[k][1] * force
+                sx -= arm[0]
+                sy -= arm[1]
+                sz -= arm[2]
+        return vec3(fx, fy, fz), vec3(sx, sy, sz)
+
+    @wp.func_native(FETCH)
+    def fetch(i: wp.int32, list_pos: wp.array(dtype=vec3)): ...
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def node_sweep(
@@ -200,6 +223,8 @@ def make_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
         sum_last = vec3(zero, zero, zero)
         for k in range(segments):
             i = first + k
+            if wp.static(has_pairs):
+                fetch(i, list_pos)
             x1 = node_pos[i + 1]
             v1 = node_velocity[i + 1]
             edge = x1 - x0

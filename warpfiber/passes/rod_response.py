@@ -10,8 +10,8 @@ Limits: the direction is that of the start of the step, where the rows were made
 """
 
 from functools import cache
-from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpfiber.laws.rod_mobility import make_rod_mobility
@@ -19,7 +19,8 @@ from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
-from warpfiber.passes.rod_relaxation import PLACE_NUMBERS, ROD_NUMBERS, make_rod_relaxation
+from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
+from warpfiber.passes.rod_relaxation import MOTION, ROD_NUMBERS, make_rod_relaxation
 from warpfiber.passes.unilateral import ContactDual
 
 
@@ -137,11 +138,15 @@ def make_rod_apply(name: str, module: str = "unique"):
 
 
 class RodResponse:
-    """The response of a cell of rods; `ContactDual` takes an instance."""
+    """The response of a cell of rods; `ContactDual` takes an instance.
+
+    parts: into which a relaxation cuts the cell; by its size unless given.
+    """
 
     by_ends = False
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, parts: int | None = None) -> None:
+        self.parts = parts
         self.relaxes = model.device.startswith("cpu")
         self.row_end = wp.zeros(0, dtype=wp.int32, device=model.device)
         self.end_move = wp.zeros(0, dtype=model.precision.real, device=model.device)
@@ -179,44 +184,14 @@ class RodResponse:
 
     def relax(self, dual: ContactDual) -> list[Launch | Call]:
         """Forces and shifts of the solution."""
-        model, rows, law = dual.model, dual.rows, dual.law
-        fibers, capacity = model.fiber_count, rows.row_i.shape[0]
-
-        def reals(size: int) -> Any:
-            return wp.zeros(size, dtype=model.precision.real, device=model.device)
-
-        work = [reals(ROD_NUMBERS * (fibers + 1)), reals(PLACE_NUMBERS * capacity)]
-        inputs = [
-            fibers,
-            dual.most,
-            wp.float64(dual.tolerance),
-            law.stiffness,
-            law.decay,
-            dual.step_size,
-            model.groups,
-            model.fiber_group,
-            model.segment_fiber,
-            dual.fiber_frozen,
-            dual.node_start,
-            rows.row_count,
-            rows.row_out_start,
-            rows.row_i,
-            rows.row_j,
-            rows.row_s,
-            rows.row_t,
-            rows.row_normal,
-            rows.row_base,
-            rows.row_compliance,
-            *work,
-            *dual.relaxation_work(),
-            dual.state.status,
-            rows.row_force,
-            dual.node_shift,
-            dual.best,
-            dual.control,
-        ]
-        kernel = make_rod_relaxation(model.precision.name, law.kind, dual.module)
-        return [Launch("rod_relax", kernel, 1, inputs)]
+        model = dual.model
+        sizes = np.full(model.fiber_count, MOTION)
+        ends = wp.zeros(model.fiber_count + 1, dtype=wp.int32, device=model.device)
+        work = relaxation_work(dual, ends, sizes, self.parts)
+        numbers = ROD_NUMBERS * model.fiber_count
+        rods = wp.zeros(numbers, dtype=model.precision.real, device=model.device)
+        kernel = make_rod_relaxation(model.precision.name, dual.law.kind, dual.module)
+        return [*relaxation_launches(kernel, work, [dual.step_size, rods])]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
         """Moves the rods by the solution."""

@@ -92,6 +92,7 @@ class ContactLaw:
 class ContactDual:
     """Solves for `rows.row_force` and leaves the response of the fibers in `node_shift`.
 
+    `tells_push`: where it relaxes, also the forces on the nodes in `node_push`.
     Arrays as long as the rows are made by `launches`, so call it again when the rows grow.
     """
 
@@ -111,6 +112,7 @@ class ContactDual:
         fiber_frozen: Any = None,
         chunks: tuple[int, int] | None = None,
         relaxes: bool | None = None,
+        tells_push: bool = False,
     ) -> None:
         self.model, self.state, self.rows, self.pairs = model, state, rows, pairs
         self.response = response
@@ -131,6 +133,8 @@ class ContactDual:
             self.relaxes,
         )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
+        pushed = model.node_count if tells_push and self.relaxes else 0
+        self.node_push = wp.zeros(pushed, dtype=model.precision.vec3, device=device)
         # how far contact moved each segment off its motion without, at most
         real, segments = model.precision.real, model.segment_count
         self.segment_shift = wp.zeros(segments, dtype=real, device=model.device)
@@ -277,17 +281,6 @@ class ContactDual:
         name, by_ends = self.model.precision.name, self.response.by_ends
         kernel = make_dual_balance(name, self.law.kind, by_ends, self.module)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
-
-    def relaxation_work(self) -> list[Any]:
-        """What `native_relaxation` keeps: rows, rows by partner, and the queue of fibers."""
-        fibers, rows, device = self.model.fiber_count, self.rows.row_i.shape[0], self.model.device
-        return [
-            wp.zeros(4 * rows, dtype=self.model.precision.real, device=device),
-            wp.zeros(fibers + 2, dtype=wp.int32, device=device),
-            wp.zeros(rows, dtype=wp.int32, device=device),
-            wp.zeros(fibers, dtype=wp.uint8, device=device),
-            wp.zeros(fibers, dtype=wp.int32, device=device),
-        ]
 
     # -- what is told -----------------------------------------------------------------------------
 

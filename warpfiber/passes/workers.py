@@ -147,15 +147,13 @@ class _Gate:
         self.seen[self.slot] += 1
 
 
-class Workers:
-    """Threads that replay their graph when told to; the caller is worker 0.
+class _Crew:
+    """Threads that replay a graph when told to; the caller is worker 0."""
 
-    `graphs`: by number of steps, the graph of every worker; one step is among them.
-    """
-
-    def __init__(self, graphs: Mapping[int, list[Any]], workers: int) -> None:
-        self.graphs = graphs
-        self.current: list[Any] | None = None
+    def __init__(self, workers: int) -> None:
+        self.users = 0
+        self.busy = threading.Lock()
+        self.graphs: list[Any] | None = None
         tickets = wp.zeros(2 * LINE * workers, dtype=wp.int32, device="cpu")
         seen = wp.zeros(2 * LINE * workers, dtype=wp.int32, device="cpu")
         self._arrays = tickets, seen
@@ -171,28 +169,59 @@ class Workers:
         go, done = self.go[worker - 1], self.done[worker - 1]
         while True:
             go.wait()
-            if self.current is None:
+            if self.graphs is None:
                 return
-            wp.capture_launch(self.current[worker])
+            wp.capture_launch(self.graphs[worker])
             done.open()
+
+    def replay(self, graphs: list[Any]) -> None:
+        """The graph of every worker, once."""
+        with self.busy:
+            self.graphs = graphs
+            for gate in self.go:
+                gate.open()
+            wp.capture_launch(graphs[0])
+            for gate in self.done:
+                gate.wait()
+
+    def close(self) -> None:
+        """End the threads."""
+        self.graphs = None
+        for gate in self.go:
+            gate.open()
+        for thread in self.threads:
+            thread.join()
+
+
+# By number of workers. One crew serves all that are open: its threads, still looking at their
+# tickets after one list of graphs, begin the next at once, where others would have to be woken.
+_crews: dict[int, _Crew] = {}
+
+
+class Workers:
+    """Replays steps, each worker its own graph of them.
+
+    `graphs`: by number of steps, the graph of every worker; one step is among them.
+    """
+
+    def __init__(self, graphs: Mapping[int, list[Any]], workers: int) -> None:
+        self.graphs = graphs
+        self.workers = workers
+        if workers not in _crews:
+            _crews[workers] = _Crew(workers)
+        self.crew = _crews[workers]
+        self.crew.users += 1
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
         """Take up to `steps` steps, looking at `halted` before each graph."""
         most = max(self.graphs)
         while steps > 0 and not halted():
             taken = most if steps >= most else 1
-            self.current = self.graphs[taken]
-            for gate in self.go:
-                gate.open()
-            wp.capture_launch(self.current[0])
-            for gate in self.done:
-                gate.wait()
+            self.crew.replay(self.graphs[taken])
             steps -= taken
 
     def close(self) -> None:
-        """End the threads."""
-        self.current = None
-        for gate in self.go:
-            gate.open()
-        for thread in self.threads:
-            thread.join()
+        """End the threads, unless others use them."""
+        self.crew.users -= 1
+        if self.crew.users == 0:
+            _crews.pop(self.workers).close()

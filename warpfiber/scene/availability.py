@@ -91,7 +91,12 @@ def unavailable_in(method: str | None, table: str, key: str, value: object) -> s
     """Return what to do instead if `method` cannot run `table.key = value`, else None."""
     rows = NOT_IN_METHOD.get(method or "", ())
     return next(
-        (_refusal(row, value) for row in rows if (row.table, row.key) == (table, key)), None
+        (
+            _refusal(row, value, f"method {method}")
+            for row in rows
+            if (row.table, row.key) == (table, key)
+        ),
+        None,
     )
 
 
@@ -103,11 +108,11 @@ def unavailable(table: str, key: str, value: object) -> str | None:
     for row in NOT_IN_THIS_VERSION:
         if (row.table, row.key) != (table, key):
             continue
-        return _refusal(row, value)
+        return _refusal(row, value, "this version")
     return None
 
 
-def _refusal(row: Row, value: object) -> str | None:
+def _refusal(row: Row, value: object, where: str) -> str | None:
     """Return what is wrong with a value of a row, None if it is available."""
     entries = value if isinstance(value, tuple) else (value,)
     missing = [entry for entry in entries if entry not in row.available]
@@ -115,4 +120,4 @@ def _refusal(row: Row, value: object) -> str | None:
         return None
     names = ", ".join(dict.fromkeys(str(entry) for entry in missing)) if row.available else ""
     subject = f"{names} is " if isinstance(value, tuple) and names else ""
-    return f"{subject}not available in this version; {row.advice}"
+    return f"{subject}not available in {where}; {row.advice}"
