@@ -71,6 +71,12 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
             if status[wp.static(HALT)] != 0:
                 return
         i = wp.tid() + offset
+        if wp.static(is_step):
+            acting = wp.int32(0)
+            for k in range(out_start[i], out_start[i + 1]):
+                acting += wp.int32(pair_acts[k])
+            if acting == 0:
+                return
         node_i = segment_node[i]
         fiber_i = segment_fiber[i]
         gi = groups[fiber_group[fiber_i]]
