@@ -59,10 +59,14 @@ def packed_scene(
     )
 
 
-@pytest.fixture(scope="module")
-def packed() -> Iterator[Simulation]:
-    """The cell after its first step that was kept."""
+@pytest.fixture(scope="module", params=["relaxed", "gradients"])
+def packed(request: pytest.FixtureRequest) -> Iterator[Simulation]:
+    """The cell after its first step that was kept, by both solvers of contact forces."""
     sim = Simulation(packed_scene(), workers=1)
+    for _, dual in sim.method.contact.solves:  # type: ignore[attr-defined]
+        dual.relaxes = request.param == "relaxed"
+        if not dual.relaxes:
+            dual.node_push = dual.node_push[:0]
     assert sim.model.starts_bent
     assert not sim.method.load.contact_load.numpy().any()  # type: ignore[attr-defined]
     sim.step(1)

@@ -17,6 +17,7 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.crossing import PLANAR, make_crossing
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
+from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import make_closest_points, make_wall_gap
 
@@ -83,7 +84,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         """Largest overlap of a segment, and how many it passed through; a wall is partner -1."""
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
+        i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
         node_i = segment_node[i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
