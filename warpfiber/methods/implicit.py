@@ -6,7 +6,6 @@ end (time, flow; acceptance and the size of the next step where it may be reject
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
@@ -30,6 +29,7 @@ from warpfiber.passes.executor import Call, Launch, Repeat, flat, load_kernels
 from warpfiber.passes.fiber_stress import FiberStress
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.pairs import PairFeatures
+from warpfiber.passes.relaxation_launches import PARTED
 from warpfiber.passes.step_control import (
     ERROR_CHUNKS,
     make_largest_error,
@@ -87,8 +87,8 @@ class Implicit(Method):
         self.module = kernel_module("step", p.name, method, sheared, self.adaptive, self.meets)
 
     def _worker_break_even(self) -> float:
-        """With contact none: every update of its forces hands over three times between workers."""
-        return math.inf if has_contact(self.scene) else super()._worker_break_even()
+        """With contact as many as are relaxed in parts: else one worker finds all forces."""
+        return PARTED if has_contact(self.scene) else super()._worker_break_even()
 
     def _make_contact(self, response: MovingResponse, load: StepLoad | None = None) -> None:
         """Contact, once the arrays of the method exist."""

@@ -27,7 +27,7 @@ from warpfiber.passes.unilateral import ContactDual
 
 @cache
 def make_chain_load(name: str, loaded: bool, module: str = "unique"):
-    """`lay_on`, `take_off`, `note_load`, `keep_load`: one thread per fiber each, by name.
+    """`lay_on`, `take_off`, `note_load`, `add_load`, `keep_load`, by name: a thread per fiber.
 
     `loaded`: nodes have loads of the scene, or are held.
     """
@@ -172,6 +172,25 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
         new_load[first + segments] = new_load[first + segments] + behind
 
     @wp.kernel(**options)
+    def add_load(
+        offset: wp.int32,
+        again: wp.int32,
+        fiber_node_start: wp.array(dtype=wp.int32),
+        node_push: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+        new_load: wp.array(dtype=vec3),
+    ):
+        """The same where the solve has left the forces on the nodes."""
+        if status[wp.static(HALT)] != 0:
+            return
+        fiber = wp.tid() + offset
+        for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
+            push = node_push[i]
+            if again != 0:
+                push += new_load[i]
+            new_load[i] = push
+
+    @wp.kernel(**options)
     def keep_load(
         offset: wp.int32,
         rejected: wp.array(dtype=wp.int32),
@@ -192,7 +211,9 @@ def make_chain_load(name: str, loaded: bool, module: str = "unique"):
                 is_loaded = wp.uint8(1)
         fiber_loaded_out[fiber] = is_loaded
 
-    return {"lay_on": lay_on, "take_off": take_off, "note_load": note_load, "keep_load": keep_load}
+    kernels = [lay_on, take_off, note_load, add_load, keep_load]
+    names = ["lay_on", "take_off", "note_load", "add_load", "keep_load"]
+    return dict(zip(names, kernels, strict=True))
 
 
 class ChainLoad:
@@ -260,6 +281,10 @@ class ChainLoad:
     def note(self, dual: ContactDual, again: bool) -> Launch:
         """After a solve: its forces on the nodes."""
         rows = dual.rows
+        if dual.node_push.shape[0] > 0:
+            first = [1 if again else 0, self.model.fiber_node_start]
+            pushed = [dual.node_push, self.state.status, self.new_load]
+            return self._launch("add_load", [*first, *pushed], follows=True)
         inputs = [
             1 if again else 0,
             self.model.fiber_node_start,

@@ -34,6 +34,7 @@ BEGIN, ROWS, PARTS, REST, END = range(5)
 # visits ahead: who is visited after so many has its list and motion, its rows, and the motions of
 # its partners fetched
 FAR, NEAR, NEXT = 6, 4, 2
+LOOKS = 3  # at the rows of a fiber in one visit, while they are at hand
 
 # y(f) as in `laws.contact_compliance`, and its largest slope; contact: the sum of two radii.
 OPENING = {
@@ -176,7 +177,11 @@ RELAX = """
             head = head + 1 == held_most ? 0 : head + 1;
             --held;
             d.fiber_queued.data[f] = 0;
-            each_end(f, [&](int r, int) { look_at(r, T(1)); });
+            for (int look = 0; look < LOOKS; ++look) {
+                const long long before = relaxed;
+                each_end(f, [&](int r, int) { look_at(r, T(1)); });
+                if (relaxed == before) break;
+            }
         }
     };
     if (!whole) {
@@ -234,6 +239,20 @@ LEAVE = """
         for (int k = 0; k < nodes; ++k)
             for (int c = 0; c < 3; ++c) d.node_shift.data[node + k][c] = mine[4 * k + c];
         leave(f, mine);
+        if (d.node_push.shape[0] == 0) continue;
+        for (int k = 0; k < nodes; ++k) d.node_push.data[node + k] = {};
+        each_end(f, [&](int r, int side) {
+            const Row& row = rows[r];
+            const int at = side == 0 ? row.at_i : row.at_j;
+            if (row.force == T(0) || at == still) return;
+            const int k = node + (at - d.fiber_at.data[f]) / 4;
+            const T share = side == 0 ? row.s : row.t, sign = side == 0 ? T(-1) : T(1);
+            for (int c = 0; c < 3; ++c) {
+                const T push = sign * row.force * row.normal[c];
+                d.node_push.data[k][c] += (T(1) - share) * push;
+                d.node_push.data[k + 1][c] += share * push;
+            }
+        });
     }
     return;
 """
@@ -267,6 +286,7 @@ def relaxation_text(name: str, law: str, fibers: str, types: str = "") -> str:
         "FAR": FAR,
         "NEAR": NEAR,
         "NEXT": NEXT,
+        "LOOKS": LOOKS,
     }.items():
         text = text.replace(key, str(value))
     return text

@@ -15,8 +15,10 @@ import warp as wp
 from warpfiber.model import HALT, precision
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE, PairFeatures, make_pair_geometry
+from warpfiber.passes.portions import portioned
 from warpfiber.passes.row_geometry import PARALLEL, make_closest_points, make_row_geometry
 
+AHEAD = 32  # pairs whose nodes are fetched
 CHUNK_SEGMENTS = 64  # per launch index on the CPU: workers share pairs in such portions
 
 # Rows (x, y, z, unused) of a pair as they lie in memory, then transposed to a vector per component;
@@ -56,6 +58,14 @@ BLOCK = """
     const T* const back = (const T*)node_back.data;
     const T* const now = (const T*)node_pos.data;
     for (int k = first; k < last; k += W) {
+        // partners are anywhere in memory
+        for (int ahead = k + AHEAD; ahead < k + AHEAD + W && ahead < last; ++ahead) {
+            const long long j = 3ll * segment_node.data[pair_j.data[ahead]];
+            __builtin_prefetch(back + j);
+            __builtin_prefetch(back + j + 5);
+            __builtin_prefetch(now + j);
+            __builtin_prefetch(now + j + 5);
+        }
         R ra[W], rb[W], rd[W], rw[W], rwa[W], rwb[W];
         for (int l = 0; l < W; ++l) {
             const int pair = k + l < last ? k + l : last - 1;
@@ -156,6 +166,7 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         "MASK": (1 << IMAGE_BITS) - 1,
         "HALF": 1 << (IMAGE_BITS - 1),
         "BITS": IMAGE_BITS,
+        "AHEAD": AHEAD,
         "PERIODIC": str(periodic).lower(),
         "NONE": NO_IMAGE,
         "PARALLEL": repr(PARALLEL),
@@ -195,7 +206,8 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
     ):
         if status[wp.static(HALT)] != 0:
             return
-        begin = (wp.tid() + offset) * wp.static(CHUNK_SEGMENTS)
+        chunks = (segments + wp.static(CHUNK_SEGMENTS - 1)) / wp.static(CHUNK_SEGMENTS)
+        begin = portioned(wp.tid() + offset, chunks, 1) * wp.static(CHUNK_SEGMENTS)
         motion_block(
             out_start[begin],
             out_start[wp.min(begin + wp.static(CHUNK_SEGMENTS), segments)],

@@ -57,7 +57,8 @@ def relaxation_work(
     work.fiber_order, work.part_start = zeros(fibers), zeros(parts + 2)
     work.part_relaxed = zeros(parts, wp.int64)
     work.fiber_queued, work.queue = zeros(fibers, wp.uint8), zeros(fibers)
-    work.node_shift, work.best, work.control = dual.node_shift, dual.best, dual.control
+    work.node_shift, work.node_push = dual.node_shift, dual.node_push
+    work.best, work.control = dual.best, dual.control
     return work
 
 

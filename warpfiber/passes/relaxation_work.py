@@ -65,6 +65,7 @@ def relaxation_struct(name: str) -> Any:
         fiber_queued: wp.array(dtype=wp.uint8)
         queue: wp.array(dtype=wp.int32)
         node_shift: wp.array(dtype=vec3)
+        node_push: wp.array(dtype=vec3)  # forces on nodes, if they are asked for
         best: wp.array(dtype=wp.float64)
         control: wp.array(dtype=wp.int32)
 
@@ -91,5 +92,7 @@ def make_relaxation_begin(name: str) -> Any:
                 d.end_start[fiber + 1] = 0
             for node in range(d.node_shift.shape[0]):
                 d.node_shift[node] = vec3()
+            for node in range(d.node_push.shape[0]):
+                d.node_push[node] = vec3()
 
     return begin_solve

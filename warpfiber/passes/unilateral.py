@@ -92,6 +92,7 @@ class ContactLaw:
 class ContactDual:
     """Solves for `rows.row_force` and leaves the response of the fibers in `node_shift`.
 
+    `tells_push`: where it relaxes, also the forces on the nodes in `node_push`.
     Arrays as long as the rows are made by `launches`, so call it again when the rows grow.
     """
 
@@ -111,6 +112,7 @@ class ContactDual:
         fiber_frozen: Any = None,
         chunks: tuple[int, int] | None = None,
         relaxes: bool | None = None,
+        tells_push: bool = False,
     ) -> None:
         self.model, self.state, self.rows, self.pairs = model, state, rows, pairs
         self.response = response
@@ -131,6 +133,8 @@ class ContactDual:
             self.relaxes,
         )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
+        pushed = model.node_count if tells_push and self.relaxes else 0
+        self.node_push = wp.zeros(pushed, dtype=model.precision.vec3, device=device)
         # how far contact moved each segment off its motion without, at most
         real, segments = model.precision.real, model.segment_count
         self.segment_shift = wp.zeros(segments, dtype=real, device=model.device)
