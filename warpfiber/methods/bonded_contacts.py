@@ -58,6 +58,7 @@ class BondedContacts:
         p, device = self.model.precision, self.model.device
         size = self.search.list.pair_capacity
         self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
+        self.push = wp.zeros(size, dtype=p.real, device=device)  # without dashpot
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)

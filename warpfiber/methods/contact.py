@@ -176,6 +176,7 @@ class ImplicitContact:
             lattice_now=step.ends_lattice[1:2],
             fiber_frozen=fiber_frozen,
             solves=self.solves,
+            tears=self.packed,
         )
         self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)

@@ -107,6 +107,7 @@ class Energies:
             spheres.node_spin,
             state.step,
             contacts.acts,
+            contacts.push,
             contacts.force,
             contacts.arms,
             contacts.memory,

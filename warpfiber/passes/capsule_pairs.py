@@ -127,6 +127,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
+        pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
         pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
@@ -229,6 +230,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_step[now & 1, k] = now
             force -= size * n
             pair_acts[k] = wp.uint8(1)
+            pair_push_out[k] = push[0]
             pair_force_out[k] = force
             pair_moment_out[k] = wp.cross(n, force)
             pair_arms_out[k] = vec4(s, t, arm_i, arm_j)
