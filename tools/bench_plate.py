@@ -11,7 +11,8 @@ contact against the exact orientation of their own start. Seconds are CPU second
 --volume F takes that part of the cell's fibers (1: all), for a quick look.
 `packed`, `packed_tolerance`, `packed_segments`: the same of chains in contact at all of the
 concentration, in a cell of 2.2 x 2.2 x 0.3 mm with fibers half as long (977 chains). Chains of
-other segments are packed otherwise, so that the last also has the scatter between starts.
+other segments are packed otherwise. Curves are means over --seeds cells; what is left of their
+scatter is in the errors.
 """
 
 from __future__ import annotations
@@ -62,12 +63,20 @@ def plate_rows(args: argparse.Namespace, common: Common) -> Iterator[dict[str, A
         small = name.startswith("packed")
         touching = small or name in ("rods", "tolerance")
         fraction = args.volume * (0.5 * FULL if touching and not small else FULL)
-        reference, last, start = None, None, None
+        reference, last = None, None
+        starts: dict[int, Placement] = {}
+        # one small cell differs from another by more than what is asked for
+        seeds = range(1, args.seeds + 1) if small else (None,)
         for numerics in reversed(parts[name]):
-            scene = plate_scene(numerics, fraction, touching, args.set, small)
-            if start is None or name.endswith("segments"):
-                start = place_fibers(scene)
-            curve, row = _run(scene, start, args, common)
+            found = []
+            for seed in seeds:
+                settings = args.set if seed is None else [*args.set, ("seed", seed)]
+                scene = plate_scene(numerics, fraction, touching, settings, small)
+                start = starts.get(seed or 0)
+                if start is None or name.endswith("segments"):
+                    start = starts[seed or 0] = place_fibers(scene)
+                found.append(_run(scene, start, args, common))
+            curve, row = _mean(found)
             if name == "exact":
                 reference = exact_curve(scene, start, args.strain)
             row |= {"bench": f"plate {name}", **numerics}
@@ -142,6 +151,18 @@ def exact_curve(scene: Scene, start: Placement, strain: float) -> Curve:
 
 def _marks(strain: float) -> np.ndarray:
     return np.arange(1.0, strain + 0.5)
+
+
+def _mean(found: list[tuple[Curve, dict[str, Any]]]) -> tuple[Curve, dict[str, Any]]:
+    """Mean curve and row of runs that differ in their seed alone, overlaps the largest."""
+    curves, rows = zip(*found, strict=True)
+    row = dict(rows[0])
+    for key in ("seconds_cpu", "steps", "rejected_steps", "a11", "a11_fiber"):
+        row[key] = round(float(np.mean([one[key] for one in rows])), 5)
+    row["overlap_max"] = max(one["overlap_max"] for one in rows)
+    if len(rows) > 1:
+        row["seeds"] = len(rows)
+    return np.mean(curves, axis=0), row
 
 
 def _run(

@@ -118,7 +118,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_row_kernels, (_LISTED,)),
     (make_row_count, (_ROWS,)),
     (make_row_fill, (_ROWS,)),
-    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True),)),
+    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
     (make_wide_kernels, ()),

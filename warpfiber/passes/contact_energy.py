@@ -5,8 +5,10 @@ segment, so they do not depend on the number of workers.
 Source: laws `capsule_contact` and `friction`. A force F does the work F . v dt with v the velocity
     after the second half kick, since nodes have v - a dt / 2 before and v + a dt / 2 after it.
     Friction dissipates what is put in against it less what its memories store.
-Limits: pushes at nodes of bent fibers and along partial lines follow from no potential: there 1 to
-    2 % of the energy of an impact is not accounted for, whatever dt.
+Limits: the shares that the minima beside a kink have in one patch (`capsule_touch`) go with how far
+    these are from the node, and no force goes with that: two fibers that bend around each other at
+    their nodes gain 2 % of the energy of an impact, whatever dt. Pushes along partial lines follow
+    from no potential either.
 """
 
 from functools import cache
