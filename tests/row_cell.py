@@ -102,7 +102,9 @@ class RowCell:
         )
         return side, moved[node : node + 2]
 
-    def expected(self, keep: float = NEAR) -> list[tuple[int, int, tuple[int, ...], PairRow]]:
+    def expected(
+        self, keep: float = NEAR, near_now: float = -np.inf
+    ) -> list[tuple[int, int, tuple[int, ...], PairRow]]:
         """Rows of pairs by the restatement, in the order of the list."""
         found = []
         fiber = self.sim.model.host["segment_fiber"]
@@ -113,7 +115,8 @@ class RowCell:
             side_j, motion_j = self.side(j, back, alone)
             radii = (self.radius(i), self.radius(j))
             turn = tuple(int(m) for m in image)
-            for row in pair_rows(side_i, side_j, motion_i, motion_j + (now - back), radii, keep):
+            motion_j = motion_j + (now - back)
+            for row in pair_rows(side_i, side_j, motion_i, motion_j, radii, keep, near_now):
                 found.append((i, j, turn, row))
         return found
 

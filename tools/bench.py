@@ -177,11 +177,14 @@ def cell_speed(
     steps = max(20, min(100, 4_000_000 // count))
     simulation.step(2 * steps)
     whole, lists, builds = [], [], method.list.build_count
+    pruning, prunes = method.search.prune_seconds, method.search.prune_count
     for _ in range(args.repeats):
         seconds, building = timed_steps(simulation, steps)
         whole.append(seconds / steps / count * 1e9)
         lists.append(building / steps / count * 1e9)
     builds = method.list.build_count - builds
+    pruning = (method.search.prune_seconds - pruning) / count * 1e9
+    prunes = method.search.prune_count - prunes
     overlap = simulation.measure()["overlap_max"]
     row = common(simulation) | {
         "strain_per_step": round(simulation.dt * scene.flow.rate, 6),
@@ -189,7 +192,8 @@ def cell_speed(
         "ns_spread": [round(min(whole), 1), round(max(whole), 1)],
         "us_per_step": round(float(np.median(whole)) * count * 1e-3, 1),
         "ns_list": round(float(np.mean(lists)), 1),
-        "ns_per_build": round(sum(lists) * steps / max(1, builds), 1),
+        "ns_per_build": round((sum(lists) * steps - pruning) / max(1, builds), 1),
+        "ns_per_pruning": round(pruning / max(1, prunes), 1),
         "ns_by_pass": passes(simulation, min(50, steps)),
         "vectorized": method.native,
         "list": method.list_report(),

@@ -68,10 +68,10 @@ Variant = tuple[Callable[..., Any], tuple[Any, ...]]
 
 NONE, FLOOR, ALL = (False, False, False), (False, False, True), (True, True, True)
 
-_HELD_RINGS = BondFeatures(dashpots=True, walls=FLOOR, loads=True, closed=True)
+_HELD_RINGS = BondFeatures(dashpots=True, walls=FLOOR, loads=True, closed=True, planes=1)
 _BED = BondFeatures(dashpots=True, walls=FLOOR, pairs=True, wall_friction=True)
 _RINGS = replace(_BED, container=True, closed=True)
-_GRIPPED = replace(_BED, press=2, loads=True, grips=True)
+_GRIPPED = replace(_BED, press=2, loads=True, grips=True, planes=1)
 _RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
 _LISTED = ListFeatures(ALL, (0, 2), True, True, True)
@@ -98,7 +98,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_contact_energy, (_RUBBING, True)),
     (make_carry_memory, (True,)),
     (make_grip_sum, ()),
-    (make_measure_bonds, (FLOOR, True, True)),
+    (make_measure_bonds, (FLOOR, True, True, 1)),
     *[(make_dual_begin, (law, True)) for law in ("hard", "linear", "exponential")],
     *[(make_dual_balance, (law, True)) for law in ("hard", "linear", "exponential")],
     (make_dual_lists, ()),
@@ -118,7 +118,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_row_kernels, (_LISTED,)),
     (make_row_count, (_ROWS,)),
     (make_row_fill, (_ROWS,)),
-    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True),)),
+    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
     (make_wide_kernels, ()),

@@ -2,10 +2,13 @@
 
     python tools/profile_step.py SCENE.toml [--set key=value] [--device D] [--steps N] [--warm N]
 
-Bytes: every array that a kernel reads or writes, once each, pair arrays up to the pairs in use: the
-least that must move. They are compared with a copy of as many bytes by one core (CPU only), so that
-a pass far below that bandwidth is bound by arithmetic or latency, not by memory. Overhead: whole
-steps less their passes, timed apart; its noise is that of both.
+Bytes: every array that a kernel may read or write, once each, pair arrays up to the pairs in use:
+what a full sweep must move at least. They are compared with a copy of as many bytes by one core
+(CPU only), so that a pass far below that bandwidth is bound by arithmetic or latency, not by
+memory. One above it ended before it needed its arrays (no pair was near, nothing was left to
+repeat). Passes of one name count together; of a sort or a scan of Warp the bytes are not known.
+Overhead: whole steps less their passes, timed apart; its noise is that of both, and steps of
+implicit methods that were taken again are in it.
 """
 
 from __future__ import annotations
@@ -20,14 +23,17 @@ import warp as wp
 from machine import commit, copy_bandwidth, processor
 
 import warpfiber as wf
+from warpfiber.passes.executor import Call, Launch
 from warpfiber.scene import parse_override
 
 # Arguments that a kernel both reads and writes.
 BOTH_WAYS = {"node_pos", "node_velocity", "node_force_out", "status"}
 
 
-def bytes_moved(launch: Any, pairs: Any) -> int:
-    """Least traffic of one launch in bytes."""
+def bytes_moved(launch: Launch | Call, pairs: Any) -> int | None:
+    """Least traffic of one launch in bytes; None where Warp itself does the work."""
+    if isinstance(launch, Call):
+        return None
     total = 0
     names = [argument.label for argument in launch.kernel.adj.args]
     values = [0, *launch.inputs] if launch.split else launch.inputs
@@ -47,29 +53,37 @@ def profile(args: argparse.Namespace) -> None:
     simulation = wf.Simulation(scene, device=args.device, workers=1)
     method, count = simulation.method, simulation.model.segment_count
     simulation.step(args.warm)
-    builds_before, seconds_before = list_state(method)
+    builds_before, seconds_before, pruning_before = list_state(method)
     times = simulation.pass_times(args.steps)
     stepping = float(np.median([step_time(simulation, args.steps // 16) for _ in range(16)]))
     simulation.prepare()  # a list that grew has left no launches
     steps = args.steps + args.steps // 16 * 16
-    builds, seconds = list_state(method)
+    builds, seconds, pruning = list_state(method)
     builds, seconds = builds - builds_before, seconds - seconds_before
-    rows = [(launch.name, times[launch.name], launch) for launch in method.executor.launches]
+    pruning -= pruning_before
+    rows: dict[str, list[Launch | Call]] = {}
+    for launch in method.executor.launches:
+        rows.setdefault(launch.name, []).append(launch)
     overhead = stepping - sum(times.values())
     whole = stepping + seconds / steps
     print(f"{scene.name}: {simulation.model.fiber_count} fibers, {count} segments, ", end="")
     print(f"{scene.numerics.precision}, {simulation.device}, 1 worker")
     print(f"{processor()}, warpfiber {commit()}")
-    print(f"{'pass':10}{'us/step':>10}{'ns/seg':>9}{'share':>8}{'B/seg':>8}{'GB/s':>8}{'copy':>8}")
+    print(f"{'pass':16}{'us/step':>10}{'ns/seg':>9}{'share':>8}{'B/seg':>8}{'GB/s':>8}{'copy':>8}")
     on_cpu = simulation.device.startswith("cpu")
 
     def line(name: str, per_step: float) -> str:
         return (
-            f"{name:10}{per_step * 1e6:10.1f}{per_step / count * 1e9:9.1f}{per_step / whole:8.1%}"
+            f"{name:16}{per_step * 1e6:10.1f}{per_step / count * 1e9:9.1f}{per_step / whole:8.1%}"
         )
 
-    for name, per_step, launch in rows:
-        moved = bytes_moved(launch, method.list)
+    for name, launches in rows.items():
+        per_step, found = times[name], [bytes_moved(launch, method.list) for launch in launches]
+        known = [size for size in found if size is not None]
+        if len(known) < len(found):
+            print(line(name, per_step) + f"{'-':>8}" * 3)
+            continue
+        moved = sum(known)
         limit = copy_bandwidth(moved // 2) / 1e9 if on_cpu else float("nan")
         rate = moved / per_step / 1e9 if per_step > 0.0 else float("nan")
         print(line(name, per_step) + f"{moved / count:8.0f}{rate:8.1f}{limit:8.1f}")
@@ -78,7 +92,7 @@ def profile(args: argparse.Namespace) -> None:
     print(line("overhead", overhead))
     print(line("step", whole))
     if method.list is not None:
-        print_list(method, count, builds, seconds, steps)
+        print_list(method, count, builds, seconds - pruning, steps, pruning)
     simulation.close()
 
 
@@ -90,26 +104,52 @@ def step_time(simulation: wf.Simulation, steps: int) -> float:
     return (time.perf_counter() - begin - listing) / steps
 
 
-def list_state(method: Any) -> tuple[int, float]:
-    """Builds so far and their seconds."""
-    return (method.list.build_count if method.list else 0), method.list_seconds
+def search_of(method: Any) -> Any:
+    """The pair search of any method."""
+    return getattr(method, "search", None) or getattr(
+        getattr(method, "contact", None) or getattr(method, "contacts", None), "search", None
+    )
 
 
-def print_list(method: Any, count: int, builds: int, seconds: float, steps: int) -> None:
+def list_state(method: Any) -> tuple[int, float, float]:
+    """Builds so far, seconds of these and of pruning, those of pruning alone."""
+    if method.list is None:
+        return 0, 0.0, 0.0
+    return method.list.build_count, method.list_seconds, search_of(method).prune_seconds
+
+
+def acting_pairs(method: Any) -> str:
+    """How many listed pairs push now, or of implicit contact how many rows it solves for."""
+    contact = getattr(method, "contact", None)
+    if contact is not None:
+        rows = [int(rows.row_count.numpy()[0]) for rows, _ in contact.solves]
+        return f"{max(rows)} contact rows"
+    acts = method.saved().get("contact_acts", method.pair_acts.numpy())
+    return f"{acts[: method.list.pair_count].astype(bool).sum() / method.list.pair_count:.1%} act"
+
+
+def print_list(
+    method: Any, count: int, builds: int, seconds: float, steps: int, pruning: float
+) -> None:
     """Statistics of the neighbor list."""
     pairs, report = method.list, method.list_report()
     kept = max(1, pairs.kept_count)
-    acting = int(method.pair_acts.numpy()[: pairs.pair_count].astype(bool).sum())
     rows = {
         "builds": f"{builds} in {steps} steps",
         "per build": f"{seconds / max(builds, 1) / count * 1e9:.0f} ns per segment",
         "skin": f"{report['skin_diameters']} diameters, mean {report['skin_mean_diameters']}",
         "listed pairs": f"{pairs.pair_count / count:.3f} per segment",
-        "acting pairs": f"{acting / count:.3f} per segment",
+        "of these": acting_pairs(method) if pairs.pair_count else "none",
         "capacity": f"{pairs.pair_capacity} pairs",
         "cells": "x".join(map(str, pairs.cells.numpy()[0])),
         "pieces": f"{pairs.piece_count / count:.2f} per segment",
     }
+    if "prunes" in report:
+        wide = (
+            f"{pairs.kept_count / count:.3f} pairs, skin {report['wide_skin_diameters']} diameters"
+        )
+        rows["wide list"] = f"{wide}, pruned {report['prunes']} times beside builds since the start"
+        rows["pruning"] = f"{pruning / steps / count * 1e9:.1f} ns per segment-step"
     if "compared" in report:
         rows["candidates"] = (
             f"{report['in_cells'] / kept:.1f} in cells, {report['compared'] / kept:.1f} compared, "

@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     export = add("export", "Write a run in another format.")
     export.add_argument("format", choices=["usd"])
     export.add_argument("result", help="result folder or its run.vtkhdf")
-    export.add_argument("--out", metavar="FILE", help=".usdc, .usda or .usd")
+    export.add_argument("--out", type=_usd_name, metavar="FILE", help=".usdc, .usda or .usd")
     export.add_argument(
         "--frames", type=_frames, metavar="A:B:S", help="first:last:step, as a slice"
     )
@@ -119,6 +119,12 @@ def _frames(text: str) -> slice:
         return slice(*(int(part) if part else None for part in text.split(":")))
     except (TypeError, ValueError):
         raise argparse.ArgumentTypeError("must be like 0:100:10, -1:") from None
+
+
+def _usd_name(text: str) -> str:
+    if not text.endswith((".usdc", ".usda", ".usd")):
+        raise argparse.ArgumentTypeError("the name must end in .usdc, .usda or .usd")
+    return text
 
 
 def _load(args: argparse.Namespace) -> Any:

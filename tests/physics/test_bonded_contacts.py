@@ -172,20 +172,30 @@ def test_workers_and_restart(precision: str) -> None:
     runs = [heap(workers=n, precision=precision) for n in (1, 2, 3)]
     again = heap(precision=precision)
     for sim in runs:
-        sim.step(1100)
+        sim.step(200)
+    assert_same(runs)
+    runs[0].step(900)
     saved = runs[0].snapshot()
     assert saved["contact_acts"].sum() > 3
-    again.restore(saved)
-    for sim in (*runs, again):
-        sim.step(900)
-    first = runs[0].snapshot()
     for sim in (*runs[1:], again):
+        sim.restore(saved)
+    built = runs[0].method.list.build_count  # type: ignore[union-attr]
+    for sim in (*runs, again):
+        sim.step(400)
+    assert runs[0].method.list.build_count > built + 1  # type: ignore[union-attr]
+    assert_same([*runs, again])
+    for sim in (*runs, again):
+        sim.close()
+
+
+def assert_same(runs: list[Simulation]) -> None:
+    """All arrays of all runs agree to the last bit."""
+    first = runs[0].snapshot()
+    for sim in runs[1:]:
         other = sim.snapshot()
         assert first.keys() == other.keys()
         for name, value in first.items():
             assert value.tobytes() == other[name].tobytes(), name
-    for sim in runs:
-        sim.close()
 
 
 SCENE = """

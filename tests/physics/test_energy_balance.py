@@ -83,6 +83,20 @@ def on_a_belt(fraction: float) -> Simulation:
     )
 
 
+def on_an_incline(fraction: float) -> Simulation:
+    """A fiber on a plane of its own that stands askew and moves along itself."""
+    tilted = {"name": "chute", "normal": [-0.6, 0.0, 0.8], "position": [0.5, 0.5, 0.5]}
+    middle = np.array([0.5, 0.5, 0.5]) + 0.99 * RADIUS * np.array([-0.6, 0.0, 0.8])
+    return start_rods(
+        [rod(middle.tolist(), 90.0, 6)],
+        contact={"law": "none", "damping": 0.113},
+        gravity={},
+        wall=[tilted | {"friction": 0.5, "velocity": [0.16, 0.1, 0.12]}],
+        numerics={"dt_fraction": fraction},
+        quantities=["energy"],
+    )
+
+
 def squeezed(fraction: float) -> Simulation:
     """Three crossed fibers between walls, of which the upper one comes down."""
     rods = [rod([0.5, 0.5, (0.99 + 1.98 * k) * RADIUS], 90.0 * k, 7) for k in range(3)]
@@ -102,6 +116,7 @@ CASES: dict[str, tuple[Callable[[float], Simulation], float, float]] = {
     "crossing": (crossing, 0.01, 1e-3),
     "on a plane": (on_a_plane, 0.03, 3e-3),
     "on a belt": (on_a_belt, 0.03, 3e-3),
+    "on an incline": (on_an_incline, 0.03, 3e-3),
     "squeezed": (squeezed, 0.01, 2e-4),
 }
 

@@ -124,6 +124,23 @@ def test_crossed_rods_pressed_together() -> None:
     assert volume == pytest.approx(60.0**3, rel=1e-9)
 
 
+def test_contacts_are_told_as_they_begin() -> None:
+    """Two crossed rods that an extension brings together: nothing before they touch, then 2 F."""
+    kind, rate = Kind(1, 19.0), 0.1
+    fibers = [
+        straight_fiber(kind, (0.0, 1.0, 0.0), (30.0, 30.0, 28.975)),
+        straight_fiber(kind, (1.0, 0.0, 0.0), (30.0, 30.0, 31.025)),
+    ]
+    flow = {"kind": "planar_extension", "extension_rate": rate, "viscosity": 1.0}
+    contact, numerics = {"law": "exponential"}, {"dt": 0.05, "contact_tolerance": 1e-7}
+    sim = cell(kind, fibers, "rigid_rod", flow=flow, contact=contact, numerics=numerics)
+    sim.step()
+    assert not tensor(sim.measure(), "stress_contact").any()
+    sim.step(20)
+    found = tensor(sim.measure(), "stress_contact")
+    assert found[2, 2] == pytest.approx(-2.0 * rate * 6.0 * np.pi * 20.0 / 60.0**3, rel=1e-2)
+
+
 @pytest.mark.parametrize("method", ["rigid_rod", "overdamped"])
 @pytest.mark.parametrize("boundary", ["periodic", "wall"])
 def test_contacts_pass_on_force_times_the_way_between_middles(method: str, boundary: str) -> None:

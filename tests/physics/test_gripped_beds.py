@@ -176,9 +176,12 @@ def holds(sim: Simulation) -> list[list[int]]:
 
 
 def test_what_is_gripped() -> None:
-    """Fibers: whole ones that reach into a grip, the one that holds more. Nodes: those inside."""
+    """Fibers: whole ones that reach into a grip, the one that holds more, else the lower.
+
+    Nodes: those inside.
+    """
     low, high, between = upright(3, 0.01), upright(3, 0.018), upright(1, 0.014)
-    rods = [low, high, upright(6, 0.01), upright(6, 0.01 + STEP), between]
+    rods = [low, high, upright(6, 0.01), upright(6, 0.01 + STEP), upright(6, 0.0105), between]
     planes = draw("pull", 0.01 + STEP, 0.018 + 2.0 * STEP, 0.1)
     whole = drawn(rods, planes)
     assert holds(whole) == [
@@ -186,6 +189,7 @@ def test_what_is_gripped() -> None:
         [UPPER] * 4,
         [LOWER] * 7,
         [UPPER] * 7,
+        [LOWER] * 7,
         [FREE, FREE],
     ]
     nodes = drawn(rods, planes | {"freeze": "nodes"})

@@ -22,10 +22,15 @@ DT = 0.05
 
 
 def packed_scene(
-    longest: float = 1e-3, averages: tuple[float, float] = (4e-4, 5.3e-4), **numerics: Any
+    longest: float = 1e-3,
+    averages: tuple[float, float] = (4e-4, 5.3e-4),
+    *,
+    height: float | None = None,
+    shortest: float = 1e-4,
+    **numerics: Any,
 ) -> Any:
     """Glass in a melt, in layers of a plate: 160 fibers that random straight ones cannot be."""
-    side, height = 1.1 * longest, 0.2 * longest
+    side, height = 1.1 * longest, 0.2 * longest if height is None else height
     return scene_from_dict(
         {
             "seed": 3,
@@ -40,7 +45,7 @@ def packed_scene(
                         "number_average": averages[0],
                         "weight_average": averages[1],
                         "maximum": longest,
-                        "minimum": 1e-4,
+                        "minimum": shortest,
                     },
                     "volume_fraction": 0.0793,
                     "orientation": [0.36, 0.62, 0.02, 0, 0, 0],
@@ -97,6 +102,32 @@ def test_forces_of_a_step_that_is_kept_stay(packed: Simulation) -> None:
     assert np.abs(kept - expected).max() < 100.0 * eps * np.abs(expected).max()
 
 
+def test_free_ends_near_a_fiber_have_rows(packed: Simulation) -> None:
+    """Every fiber less than 1.5 radii from a free end at the start of the step, by brute force."""
+    host, radius = packed.model.host, packed.model.group_rows[0]["radius"]
+    method = packed.method
+    nodes = method.node_back.numpy().astype(float)  # type: ignore[attr-defined]
+    fiber, first = host["segment_fiber"], host["segment_node"]
+    start, span = nodes[first], nodes[first + 1] - nodes[first]
+    box = np.asarray(packed.model.domain.size)
+    rows = last_rows(packed)
+    met = {
+        frozenset((fiber[i], fiber[j])) for i, j in zip(rows["i"], rows["j"], strict=True) if j >= 0
+    }
+    near = set()
+    turns = [np.array([u, v, 0.0]) * box for u in (-1, 0, 1) for v in (-1, 0, 1)]
+    begin = host["fiber_node_start"]
+    for f, (low, high) in enumerate(zip(begin, begin[1:], strict=False)):
+        for end in (nodes[low], nodes[high - 1]):
+            for turn in turns:
+                apart = end + turn - start
+                s = np.clip((apart * span).sum(1) / (span**2).sum(1), 0.0, 1.0)
+                gap = np.linalg.norm(apart - s[:, None] * span, axis=1) - 2.0 * radius
+                near |= {frozenset((f, k)) for k in fiber[gap < 1.5 * radius] if k != f}
+    assert len(near) > 20
+    assert near <= met
+
+
 def test_packed_cell_moves_by_whole_steps() -> None:
     """900 fibers as bent as in the whole plate: few steps are halved, and soon hardly any.
 
@@ -139,3 +170,14 @@ def test_continued_cell_is_the_same() -> None:
     assert again.node_pos.tobytes() == first.node_pos.tobytes()
     for sim in (first, again):
         sim.close()
+
+
+def test_a_step_that_tears_a_fiber_is_taken_by_halves() -> None:
+    """979 fibers, one of which contact forces would throw to twice its length in one step."""
+    averages, tolerance = (4.15e-4, 7.65e-4), 1e-2
+    scene = packed_scene(2e-3, averages, height=3e-4, shortest=5e-5, contact_tolerance=tolerance)
+    sim = Simulation(scene, workers=1)
+    sim.run(until=1.5)
+    assert rejected(sim) > 0
+    assert sim.method._segment_stretch().max() < 1.1
+    sim.close()

@@ -20,14 +20,13 @@ BELT = {"name": "z-", "velocity": [0.1, 0.0, 0.0]}
 
 
 def lying(*walls: dict[str, Any], friction: float = 0.0, **tables: Any) -> Simulation:
-    """A fiber at rest along x on the lower wall, pressed by its weight."""
+    """A fiber at rest along x on the lower wall of WALLS, pressed by its weight."""
     rest = np.array([0.5, 0.5, RADIUS - 1.5e-6]) + np.outer(np.arange(7) * STEP, [1.0, 0.0, 0.0])
     return start_rods(
         [ref.Rod(rest, RADIUS, caps="capsule")],
-        box=WALLS,
         wall=list(walls),
         contact={"law": "none", "damping": 0.5, "wall_friction": friction},
-        **{"gravity": {}, **tables},
+        **{"box": WALLS, "gravity": {}, **tables},
     )
 
 
@@ -109,9 +108,101 @@ def test_friction_of_a_container() -> None:
     assert (speed(sim)[2] - first) / 0.05 == pytest.approx(-0.6 * 9.81, rel=0.01)
 
 
+def chute(tilt: float, **keys: Any) -> dict[str, Any]:
+    """A plane through the middle that falls along x."""
+    normal = [math.sin(tilt), 0.0, math.cos(tilt)]
+    return {"name": "chute", "normal": normal, "position": [0.5, 0.5, 0.05], **keys}
+
+
+def on_chute(tilt: float, friction: float) -> Simulation:
+    """A fiber that lies along the fall of a plane in an open box."""
+    along = np.array([math.cos(tilt), 0.0, -math.sin(tilt)])
+    normal = np.array([math.sin(tilt), 0.0, math.cos(tilt)])
+    rest = np.array([0.5, 0.5, 0.05]) + (RADIUS - 1.5e-6) * normal
+    rest = rest + np.outer(np.arange(7) * STEP, along)
+    return start_rods(
+        [ref.Rod(rest, RADIUS, caps="capsule")],
+        wall=[chute(tilt, friction=friction)],
+        contact={"law": "none", "damping": 0.5},
+        gravity={},
+    )
+
+
+@pytest.mark.parametrize(("friction", "slides"), [(0.9, False), (0.3, True)])
+def test_chute(friction: float, slides: bool) -> None:
+    """A fiber along a plane askew sticks above tan of its tilt and slides below."""
+    tilt = 0.6
+    sim = on_chute(tilt, friction)
+    sim.run(time=0.05)
+    first = np.linalg.norm(speed(sim))
+    sim.run(time=0.1)
+    rate = (np.linalg.norm(speed(sim)) - first) / 0.05
+    expected = 9.81 * (math.sin(tilt) - friction * math.cos(tilt)) if slides else 0.0
+    assert rate == pytest.approx(expected, abs=0.01 * 9.81)
+
+
+def test_level_plane_is_a_wall() -> None:
+    """A plane of its own in the place of a wall of the box does the same; rounding."""
+    wall = lying({"name": "z-", "friction": 0.3, "velocity": [0.1, 0.0, 0.0]})
+    level = {"name": "floor", "normal": [0, 0, 1], "position": [0.2, 0.1, 0.0], "friction": 0.3}
+    plane = lying(level | {"velocity": [0.1, 0.0, 0.0]}, box=WALLS | {"boundary": ["open"] * 3})
+    for time in (0.01, 0.03):
+        for sim in (wall, plane):
+            sim.run(time=time)
+        assert np.abs(wall.node_velocity - plane.node_velocity).max() < 1e-12
+    assert np.abs(plane.node_velocity).max() > 0.01
+
+
+def test_bed_between_planes() -> None:
+    """Fibers are placed inside a trough of two planes and stay there."""
+    walls = [
+        {"name": "left", "normal": [0.6, 0.0, 0.8], "position": [0.0, 0.0, 0.03]},
+        {"name": "right", "normal": [-0.6, 0.0, 0.8], "position": [0.06, 0.0, 0.03]},
+    ]
+    tables: dict[str, Any] = {
+        "box": {"size": [0.06, 0.04, 0.12], "boundary": ["open", "periodic", "open"]},
+        "fibers": [
+            {
+                "count": 20,
+                "centerline_length": 0.024,
+                "diameter": 2.0 * RADIUS,
+                "density": 1340.0,
+                "youngs_modulus": 7.5e5,
+            }
+        ],
+        "wall": walls,
+        "gravity": {},
+        "contact": {"friction": 0.3, "wall_friction": 0.3, "damping": 0.113},
+        "stage": [{"kind": "settle", "damping": 8.0, "end_time": 0.3}],
+        "numerics": {"method": "bonded_spheres", "segments": 8, "device": "cpu"},
+    }
+    sim = Simulation(scene_from_dict(tables))
+
+    def inside(nodes: np.ndarray) -> float:
+        """Least distance of a node from the planes, m."""
+        return min(((nodes - w["position"]) @ w["normal"]).min() for w in walls)
+
+    assert inside(sim.node_pos) >= RADIUS
+    sim.run()
+    assert 0.5 * RADIUS < inside(sim.node_pos) < RADIUS
+    assert sim.node_pos[:, 2].min() > 0.0
+
+
 FAULTS: list[tuple[dict[str, Any], str, str]] = [
     ({"name": "x-"}, "wall.0.name", "walls are z- z+"),
-    ({"name": "lid"}, "wall.0.name", "alters a wall of the box"),
+    ({"name": "cylinder", "normal": [0, 0, 1], "position": [0, 0, 0]}, "wall.0.name", "a kind"),
+    ({"name": "lid", "normal": [0, 0, 1]}, "wall.0.position", "no wall of the box"),
+    ({"name": "lid", "position": [0, 0, 1]}, "wall.0.normal", "no wall of the box"),
+    (
+        {"name": "lid", "normal": [0.6, 0, 0.8], "position": [0, 0, 0]},
+        "wall.0.normal",
+        "across the periodic axis x",
+    ),
+    (
+        {"name": "lid", "normal": [0, 0, 1], "position": [0, 0, 0], "velocity": [0, 0, 1]},
+        "wall.0.velocity",
+        "in its plane alone",
+    ),
     ({"name": "z-", "normal": [0, 0, 1]}, "wall.0.normal", "box.size"),
     ({"name": "z-", "position": [0, 0, 1]}, "wall.0.position", "box.size"),
     ({"name": "z-", "velocity": "flow"}, "wall.0.velocity", "nothing flows"),

@@ -158,10 +158,25 @@ class PairRow(NamedTuple):
     gap: float
 
 
+def freedom(side: Side, s: float) -> float:
+    """How near to a free end of its fiber a place is: 1 there, 1/2 from half a segment on."""
+    ends = [0.5] + [1.0 - s] * side.first + [s] * (side.following is None)
+    return max(ends)
+
+
 def pair_rows(
-    i: Side, j: Side, motion_i: Array, motion_j: Array, radii: tuple[float, float], keep: float
+    i: Side,
+    j: Side,
+    motion_i: Array,
+    motion_j: Array,
+    radii: tuple[float, float],
+    keep: float,
+    near_now: float = -np.inf,
 ) -> list[PairRow]:
-    """Rows with a predicted gap below `keep` thinner radii; motions (2, 3) of the two nodes."""
+    """Rows with a predicted gap below `keep` thinner radii; motions (2, 3) of the two nodes.
+
+    Or with a gap below `near_now` at a free end, half of it inside a fiber.
+    """
     a = min(radii)
     rows = []
     for slot, (s, t) in sorted(counted_places(i, j, a).items()):
@@ -170,6 +185,7 @@ def pair_rows(
         normal = unit_normal(apart, distance, i.span / i.length, j.span / j.length)
         moved = (1 - t) * motion_j[0] + t * motion_j[1] - (1 - s) * motion_i[0] - s * motion_i[1]
         gap = distance - sum(radii)
-        if gap + normal @ moved < keep * a:
+        held = gap < near_now * a * max(freedom(i, s), freedom(j, t))
+        if held or gap + normal @ moved < keep * a:
             rows.append(PairRow(slot, s, t, normal, gap + float(normal @ moved), gap))
     return rows

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import warpfiber as wf
+from warpfiber.output.saved_stage import merged_arrays
 from warpfiber.scene import Fault, SceneError
 from warpfiber.simulation import Simulation
 
@@ -185,6 +186,16 @@ def test_what_may_change(settled: Path) -> None:
     sim.step(20)
     memory = sim.snapshot()["contact_memory"]
     assert np.isfinite(sim.node_pos).all() and memory.any()
+
+
+def test_a_list_is_that_of_the_memories() -> None:
+    """Where the saved scene had no contact its list is of another state: the new one's is taken."""
+    saved = {name: np.full((2, 3), 1.0) for name in ("node_pos", "list_pos")}
+    fresh = {name: np.full((2, 3), 2.0) for name in ("node_pos", "list_pos")}
+    assert merged_arrays(saved, fresh)["node_pos"][0, 0] == 1.0
+    assert merged_arrays(saved, fresh)["list_pos"][0, 0] == 2.0
+    listed = saved | {"contact_acts": np.zeros(3)}
+    assert merged_arrays(listed, fresh)["list_pos"][0, 0] == 1.0
 
 
 def faults(folder: Path, text: str) -> list[Fault]:

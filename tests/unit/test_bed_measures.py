@@ -11,6 +11,7 @@ import pytest
 from tests.reference import bonded_spheres as ref
 from tests.rods import rates, start_rods
 from warpfiber.methods.bed_measures import NODE_FIELDS
+from warpfiber.passes.measurement import fiber_pair_keys
 from warpfiber.simulation import Simulation
 
 RADIUS, STEP = 1.2e-3, 2.4e-3
@@ -166,3 +167,14 @@ def test_names_do_not_matter(angle: float, steps: int) -> None:
         assert b[name] == pytest.approx(value, rel=1e-6, abs=1e-15), name
     moved = np.abs(sim.node_pos - np.concatenate([r.rest for r in rods])).max()
     assert np.abs(again.node_pos - sim.node_pos[place]).max() < 1e-8 * moved
+
+
+def test_keys_of_fiber_pairs() -> None:
+    """Equal where fibers and image are equal, different elsewhere; none of none."""
+    rng = np.random.default_rng(1)
+    rows = rng.integers([0, 0, -40], [7, 9, 40], size=(2000, 3)).astype(np.int32)
+    keys = fiber_pair_keys(*rows.T)
+    _, expected = np.unique(rows, axis=0, return_inverse=True)
+    _, found = np.unique(keys, return_inverse=True)
+    np.testing.assert_array_equal(found, expected.ravel())
+    assert len(fiber_pair_keys(*rows[:0].T)) == 0

@@ -134,6 +134,8 @@ def test_missing_inputs(shell: Shell) -> None:
         assert shell(command, "absent") == 2, command
         assert "absent" in shell.err
     assert shell("export", "usd", "absent") == 2
+    assert shell("export", "usd", "absent", "--out", "bed.obj") == 2
+    assert "the name must end in .usdc, .usda or .usd" in shell.err
     assert shell.listing() == set()
 
 

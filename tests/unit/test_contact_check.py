@@ -28,7 +28,7 @@ SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
 BOX = {"size": [26.0, 22.0, 24.0]}
 
 
-def checked(cell: RowCell, workers: int = 1) -> ContactCheck:
+def checked(cell: RowCell, workers: int = 1, **keys: Any) -> ContactCheck:
     """The check of this cell, launched."""
     check = ContactCheck(
         cell.sim.model,
@@ -37,6 +37,7 @@ def checked(cell: RowCell, workers: int = 1) -> ContactCheck:
         node_back=cell.node_back,
         lattice_back=cell.lattice_back,
         lattice_now=cell.lattice_now,
+        **keys,
     )
     executor = Executor(check.launches(), cell.sim.model.device, workers)
     executor.run(1, never)
@@ -183,6 +184,19 @@ def test_a_position_that_is_no_number_is_the_largest_overlap(start: Start) -> No
         motion = np.zeros((4, 3))
         motion[node, 1] = np.nan
         assert checked(row_cell(start, RODS, fibers, move=motion)).largest.numpy()[0] >= 1e29
+
+
+@pytest.mark.parametrize(("stretch", "is_torn"), [(1.9, False), (2.1, True)])
+def test_a_segment_that_tore_is_the_largest_overlap(
+    start: Start, stretch: float, is_torn: bool
+) -> None:
+    """At twice its length, where that is asked for; else it is only far from the others."""
+    fibers = [straight_fiber(RODS[0], (1, 0, 0), (0.0, y, 0.0)) for y in (0.0, 3.0)]
+    motion = np.zeros((4, 3))
+    motion[1, 0] = (stretch - 1.0) * 16.0
+    cell = row_cell(start, RODS, fibers, move=motion)
+    assert (checked(cell, tears=True).largest.numpy()[0] >= 1e29) == is_torn
+    assert checked(cell).largest.numpy()[0] == 0.0
 
 
 def test_the_check_does_not_depend_on_the_workers(start: Start) -> None:

@@ -23,8 +23,10 @@ BOX = {"size": [26.0, 22.0, 24.0]}
 SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
 
 
+@pytest.mark.parametrize("near", [-1e20, 1.5])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_walls(start: Start, precision: str) -> None:
+def test_walls(start: Start, precision: str, near: float) -> None:
+    """Nodes with a small predicted gap; those with a gap below `near` at the start, too."""
     kinds = (Kind(3, 2.0), Kind(1, 3.0, radius=0.5))
     rng = np.random.default_rng(7)
     which = np.arange(40) % 2
@@ -39,8 +41,9 @@ def test_walls(start: Start, precision: str) -> None:
         box={"size": EDGES.tolist(), "boundary": ["periodic", "wall", "wall"]},
         contact={"law": "exponential", "strength": 1.0, "decay": 2.0},
     )
-    got = host_rows(cell.made())
+    got = host_rows(cell.made(near_now=near))
     host, moved = cell.sim.model.host, cell.sim.state.node_pos.numpy()
+    back = cell.node_back.numpy()
     expected = []
     for i, node in enumerate(host["segment_node"]):
         fiber = host["segment_fiber"][i]
@@ -49,7 +52,9 @@ def test_walls(start: Start, precision: str) -> None:
         for end in ends:
             for axis, edge in ((1, EDGES[1]), (2, EDGES[2])):
                 for side, y in enumerate((moved[node + end][axis], edge - moved[node + end][axis])):
-                    if y - a < 0.5 * a:
+                    now = back[node + end][axis]
+                    now = edge - now if side else now
+                    if y - a < 0.5 * a or now - a < near * a:
                         normal = np.zeros(3)
                         normal[axis] = 2 * side - 1
                         expected.append((i, end, normal, y - a))
@@ -59,7 +64,7 @@ def test_walls(start: Start, precision: str) -> None:
         assert (got["i"][r], got["s"][r]) == (i, end)
         assert (got["normal"][r] == normal).all()
         assert abs(got["base"][r] - gap) < 8 * np.finfo(cell.real).eps * 20.0
-    assert int((got["j"] >= 0).sum()) == len(cell.expected())
+    assert int((got["j"] >= 0).sum()) == len(cell.expected(near_now=near))
 
 
 def resistances(cell: RowCell, kind: str) -> list[tuple[int, int, float, float, float, float]]:

@@ -26,12 +26,12 @@ SHEAR = {"kind": "simple_shear", "shear_rate": 1.0, "viscosity": 1.0}
 BOX = {"size": [26.0, 22.0, 24.0]}
 
 
-def check_pairs(cell: RowCell, keep: float = NEAR, least: int = 20) -> None:
-    """Rows of pairs are those of the restatement."""
+def check_pairs(cell: RowCell, keep: float = NEAR, least: int = 20, **keys: float) -> int:
+    """Rows of pairs are those of the restatement; how many."""
     tolerance = TOLERANCE[cell.sim.model.precision.name]
-    rows = cell.made(keep=keep)
+    rows = cell.made(keep=keep, **keys)
     got = host_rows(rows)
-    expected = cell.expected(keep)
+    expected = cell.expected(keep, **keys)
     assert len(expected) >= least
     of_pairs = got["j"] >= 0
     assert int(of_pairs.sum()) == len(expected)
@@ -43,6 +43,7 @@ def check_pairs(cell: RowCell, keep: float = NEAR, least: int = 20) -> None:
         assert abs(got["base"][r] - row.base) < tolerance
     assert not got["compliance"].any()
     check_indices(rows, got)
+    return len(expected)
 
 
 def check_indices(rows: Any, got: dict[str, np.ndarray]) -> None:
@@ -70,6 +71,16 @@ CHAINS = (Kind(3, 3.0), Kind(4, 1.5, radius=0.6))
 def test_rows_of_random_fibers(start: Start, kinds: tuple[Kind, ...], precision: str) -> None:
     fibers, which = dropped(kinds, 40, 1, 20.0)
     check_pairs(row_cell(start, kinds, fibers, which, move=shaken(2), precision=precision))
+
+
+@pytest.mark.parametrize("kinds", [RODS, CHAINS])
+def test_near_ends_have_rows_whatever_is_foreseen(start: Start, kinds: tuple[Kind, ...]) -> None:
+    """Pairs that would move far apart; more rows the larger the gap that counts is."""
+    fibers, which = dropped(kinds, 40, 1, 20.0)
+    cell = row_cell(start, kinds, fibers, which, move=shaken(2, 2.0))
+    counts = [check_pairs(cell)]
+    counts += [check_pairs(cell, near_now=near) for near in (0.5, 1.0, 2.0)]
+    assert counts[0] < counts[1] < counts[2] < counts[3]
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])

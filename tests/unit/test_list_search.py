@@ -14,6 +14,7 @@ from tests.bonded_crowd import crowd
 from tests.cell import Kind, bent_fiber, isotropic, straight_fiber
 from tests.meeting_cell import METHODS, meeting_scene
 from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
+from warpfiber.methods.bonded_spheres import LISTED_COST
 from warpfiber.methods.pair_search import STEP_PAIR_COST
 from warpfiber.methods.skin import LEAST_SKIN, MOST_SKIN, PAIR_COST, RATIO
 from warpfiber.passes.near_pairs import PAIR_COST as NEAR_PAIR_COST
@@ -197,7 +198,7 @@ def test_pairs_cost_by_method(start: Start, monkeypatch: pytest.MonkeyPatch) -> 
         sim = Simulation(meeting_scene(method, 75), workers=1)
         assert sim.method.skin.pair_cost == STEP_PAIR_COST
         sim.close()
-    for vectors, cost in ((True, NEAR_PAIR_COST), (False, STEP_PAIR_COST)):
+    for vectors, cost in ((True, NEAR_PAIR_COST), (False, LISTED_COST)):
         monkeypatch.setattr("warpfiber.methods.bonded_spheres.NATIVE", vectors)
         bed = crowd()
         assert bed.method.contacts.search.skin.pair_cost == cost  # type: ignore[attr-defined]

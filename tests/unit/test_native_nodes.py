@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from tests.cell import Kind, bent_fiber
+from warpfiber.methods import step_launches
 from warpfiber.methods.step_launches import native_node_launch, node_launch, plain_node_launch
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
-from warpfiber.passes import native_nodes_source
 from warpfiber.passes.executor import load_kernels
-from warpfiber.passes.native_nodes import fiber_blocks, make_native_node_sweep
+from warpfiber.passes.native_nodes import fiber_blocks
 from warpfiber.simulation import Simulation
 
 Start = Callable[..., Simulation]
@@ -203,12 +203,9 @@ def test_asking_ahead(start: Start, monkeypatch: pytest.MonkeyPatch, name: str) 
     sim = crowd(start, "float64", "consistent", SCENES[name])
     sim.step(2)
     expected = sweep(sim, native_node_launch)
-    monkeypatch.setattr(native_nodes_source, "PREFETCH_NODES", 0)
-    make_native_node_sweep.cache_clear()
-    try:
-        found = sweep(sim, native_node_launch)
-    finally:
-        make_native_node_sweep.cache_clear()
+    monkeypatch.setattr(step_launches, "PREFETCH_NODES", 0)
+    assert native_node_launch(sim.method).inputs[0] == 0
+    found = sweep(sim, native_node_launch)
     for got, want in zip(found, expected, strict=True):
         np.testing.assert_array_equal(got, want)
 

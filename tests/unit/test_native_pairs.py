@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 
 from tests.cell import Array, Kind, bent_fiber, isotropic, straight_fiber
-from warpfiber.methods import bead_chain
+from warpfiber.methods import bead_chain, step_launches
 from warpfiber.methods.step_launches import pair_launch
 from warpfiber.model import HALT, PAIR_COUNT
-from warpfiber.passes import native_pairs
 from warpfiber.passes.executor import Launch, load_kernels
 from warpfiber.passes.native_pairs import BLOCK, native_chunks
 from warpfiber.simulation import Simulation
@@ -203,15 +202,9 @@ def test_asking_ahead(start: Start, monkeypatch: pytest.MonkeyPatch, lubrication
     sim = listed(start, crowd(KINDS, seed=27, count=120), lubrication, **BOX)
     assert sim.method.list.pair_count > 6 * BLOCK
     expected = results(sim, launch_of(sim, native=True))
-    makers = (native_pairs.make_pair_block, native_pairs.make_native_pair_sweep)
-    monkeypatch.setattr(native_pairs, "PREFETCH_NODES", 0)
-    for maker in makers:
-        maker.cache_clear()
-    try:
-        launch = launch_of(sim, native=True)
-    finally:
-        for maker in makers:
-            maker.cache_clear()
+    monkeypatch.setattr(step_launches, "PREFETCH_NODES", 0)
+    launch = launch_of(sim, native=True)
+    assert launch.inputs[1] == 0
     for name, values in results(sim, launch).items():
         np.testing.assert_array_equal(values, expected[name])
 

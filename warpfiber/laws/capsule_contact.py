@@ -21,6 +21,7 @@ import warp as wp
 from warpfiber.model import precision
 
 LINE_COSINE = math.cos(math.radians(30.0))  # fibers at wider angles touch at a point
+ALIGNED = LINE_COSINE**2 * (1.0 - 1e-5)  # squared cosine below which surely none is a line
 LINE_PART = 0.25  # of a segment: shorter half patches are points
 SMALLEST_SINE = 0.02
 SLENDER, POWER = 0.0684, 1.531  # exponents of F_2

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpfiber.passes.measurement import fiber_pair_keys
+
 if TYPE_CHECKING:
     from warpfiber.methods.bonded_spheres import BondedSpheres
 
@@ -35,10 +37,10 @@ def contact_forces(spheres: BondedSpheres) -> dict[str, float]:
         return row
     force = spheres.contacts.force.numpy()[: len(i)][acts].astype(float)
     force *= spheres.model.units.force
-    keys = np.stack([fiber[i[acts]], fiber[j[acts]], image[acts]], axis=1)
-    pairs, which = np.unique(keys, axis=0, return_inverse=True)
+    keys = fiber_pair_keys(fiber[i[acts]], fiber[j[acts]], image[acts])
+    pairs, which = np.unique(keys, return_inverse=True)
     total = np.zeros((len(pairs), 3))
-    np.add.at(total, which.ravel(), force)
+    np.add.at(total, which, force)
     row["contact_force_mean"] = float(np.linalg.norm(force, axis=1).mean())
     row["contact_force_pair_mean"] = float(np.linalg.norm(total, axis=1).mean())
     return row

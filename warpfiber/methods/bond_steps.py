@@ -17,8 +17,7 @@ import numpy as np
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.methods.bond_constants import bond_constants
 from warpfiber.scene import FiberGroup, Scene
-from warpfiber.scene.containers import container
-from warpfiber.scene.planes import rubs
+from warpfiber.scene.planes import present_faces, rubs
 
 Matrix = np.ndarray
 OVERLAP = 0.1  # radii, where the stiffness of a contact is taken
@@ -68,8 +67,7 @@ def bond_steps(scene: Scene, group: FiberGroup) -> dict[str, float]:
     }
     contact = scene.contact
     end, inner = (c.end_mass, c.end_inertia), (c.mass, c.inertia)
-    walled = scene.box is not None and "wall" in scene.box.boundary
-    if walled or container(scene) is not None:
+    if present_faces(scene):
         stiffness = 2.0 * c.wall_modulus * group.radius * math.sqrt(OVERLAP)
         steps["walls"] = touch_step(scene, group, end, stiffness, float(rubs(scene)))
     if contact.law != "none":

@@ -15,7 +15,7 @@ import warp as wp
 from warpfiber.methods.pair_search import PairSearch
 from warpfiber.model import Model, State
 from warpfiber.passes.capsule_pairs import CapsuleFeatures
-from warpfiber.passes.contact_memory import NEVER, carry_memories, make_carry_memory
+from warpfiber.passes.contact_memory import NEVER, launch_memories, make_carry_memory
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
 
@@ -58,40 +58,45 @@ class BondedContacts:
         p, device = self.model.precision, self.model.device
         size = self.search.list.pair_capacity
         self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
+        self.push = wp.zeros(size, dtype=p.real, device=device)  # without dashpot
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
         kept = size if self.features.friction else 0
         self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
         self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)
+        segments = self.model.segment_count
+        self.kept = [wp.zeros(segments, dtype=wp.int32, device=device) for _ in range(2)]
+        self.kept += [wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2)]
+        self.kept += [wp.zeros(size, dtype=kind, device=device) for kind in (p.vec3, p.vec4)]
+        self.kept += [wp.zeros(kept, dtype=kind, device=device) for kind in (p.vec4, wp.int32)]
 
     def kernels(self) -> list[Any]:
         """What a build launches."""
-        return [*self.search.list.kernels.values(), self._carry()]
+        return [*self.search.list.kernels.values(), *self._carrying()]
 
-    def _carry(self) -> Any:
+    def _carrying(self) -> Any:
         return make_carry_memory(self.model.precision.name, self.features.friction)
 
-    def _listed(self) -> list[Any]:
-        pairs = self.search.list
-        return [pairs.out_start, pairs.pair_j, pairs.pair_image, *self._kept()]
-
-    def _kept(self) -> list[Any]:
-        """By pair, from list to list."""
-        return [self.acts, self.force, self.arms, self.memory, self.written]
+    def _launch(self, kernel: Any, kept: list[Any]) -> None:
+        pairs, model = self.search.list, self.model
+        listed = [pairs.out_start, pairs.pair_j, pairs.pair_image]
+        listed += [self.acts, self.force, self.arms, self.memory, self.written]
+        step, device = self.state.step, model.device
+        launch_memories(kernel, model.segment_count, step, listed, kept, device)
 
     def build(self, step: int) -> bool:
         """Build the list now and take the memories over; True if arrays were replaced."""
         carries = self.search.list.build_count > 0
-        before = [wp.clone(array) for array in self._listed()] if carries else []
+        keep, carry = self._carrying()
+        kept = self.kept
+        if carries:
+            self._launch(keep, kept)
         replaced = self.search.refresh(step, wrap=False)
         if replaced:
             self._allocate()
         if carries:
-            model = self.model
-            after = self._listed()
-            step_count, segments = self.state.step, model.segment_count
-            carry_memories(self._carry(), segments, step_count, before, after, model.device)
+            self._launch(carry, kept)
         else:
             self.acts.zero_()
         return replaced
@@ -112,8 +117,11 @@ class BondedContacts:
             arrays[f"contact_{name}"] = values
         if self.features.friction:
             side = int(self.state.step.numpy()[0]) % 2
-            arrays["contact_memory"] = self.memory.numpy()[side, :count].copy()
-            arrays["contact_written"] = self.written.numpy()[side, :count].copy()
+            memory = self.memory.numpy()[side, :count].copy()
+            written = self.written.numpy()[side, :count].copy()
+            stale = written != int(self.state.step.numpy()[0])
+            memory[stale], written[stale] = 0.0, NEVER
+            arrays["contact_memory"], arrays["contact_written"] = memory, written
         return arrays
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:

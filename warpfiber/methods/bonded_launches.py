@@ -85,6 +85,7 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         spheres.node_spin,
         state.step,
         contacts.acts,
+        contacts.push,
         contacts.force,
         contacts.moment,
         contacts.arms,

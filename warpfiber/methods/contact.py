@@ -22,7 +22,7 @@ from warpfiber.methods.pair_search import PairSearch
 from warpfiber.methods.skin import MOST_SKIN
 from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
-from warpfiber.passes.contact_rows import ContactRows
+from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.step_control import HALVE
@@ -35,11 +35,15 @@ KEEP = 0.3
 # Radii: the same in a cell whose fibers are bent from the start, as packed ones are. Others hold
 # them, and where a contact opens or closes they move on by more.
 KEEP_BENT = 1.0
+# Radii: and whatever is foreseen, free ends nearer than this at the start have rows (inside a fiber
+# half of it). An end that springs from one fiber is stopped by the next, which without contact
+# would have moved apart: so ended most steps of the sliding plate that were halved.
+NEAR_BENT = 2.0
 # Radii: a step that ends with more is repeated by half. Rods hardly ever reach theirs, which costs
 # some steps in a thousand; flexible fibers would be halved often.
 OVERLAP, OVERLAP_RODS = 0.05, 0.03
 SLACK, SLACK_BENT = 20.0, 50.0  # tolerances of contact: or with more than these
-SKIN_BENT = 3.0  # diameters, where a few fibers of many spring farther than the others
+SKIN_BENT = 5.0  # diameters, where a few fibers of many spring farther than the others
 # Parts of the first step that no list lasts, below which a step is not worth taking: with a given
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
@@ -146,6 +150,7 @@ class ImplicitContact:
                 step_size=step.step_size,
                 node_foreseen=load.node_foreseen if load is not None and not again else None,
                 keep=keep,
+                near_now=NEAR_BENT if self.packed and not again else NEVER,
                 lubrication="none" if again else scene.contact.lubrication,
             )
             dual = ContactDual(
@@ -171,6 +176,7 @@ class ImplicitContact:
             lattice_now=step.ends_lattice[1:2],
             fiber_frozen=fiber_frozen,
             solves=self.solves,
+            tears=self.packed,
         )
         self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)

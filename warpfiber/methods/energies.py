@@ -107,6 +107,7 @@ class Energies:
             spheres.node_spin,
             state.step,
             contacts.acts,
+            contacts.push,
             contacts.force,
             contacts.arms,
             contacts.memory,
@@ -118,7 +119,9 @@ class Energies:
 
     def _bond_kernel(self) -> Any:
         features, name = self.spheres.features, self.spheres.model.precision.name
-        return make_measure_bonds(name, features.walls, features.wall_friction, features.container)
+        return make_measure_bonds(
+            name, features.walls, features.wall_friction, features.container, features.planes
+        )
 
     def kernels(self) -> list[Any]:
         """What a measurement launches."""
@@ -172,7 +175,7 @@ class Energies:
         }
         present = {
             "energy_gravity": spheres.scene.gravity is not None,
-            "energy_wall": any(features.walls) or features.container,
+            "energy_wall": features.walled,
             "energy_contact": contacts is not None,
             "energy_friction": rubs,
             "dissipated_bonds": features.dashpots,

@@ -136,6 +136,7 @@ class NativeBonds:
             spheres.node_spin,
             state.step,
             contacts.acts,
+            contacts.push,
             contacts.force,
             contacts.moment,
             contacts.arms,

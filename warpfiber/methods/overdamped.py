@@ -108,7 +108,8 @@ class Overdamped(Implicit):
             hold, given = self.load.step_hold, self.load.step_load
         inputs = [
             stages,
-            (2 if self.adaptive else 1) if self.keeps else 0,
+            # a packed fiber that forces tear in one step is spared by a shorter one
+            (2 if self.adaptive or self.paced else 1) if self.keeps else 0,
             1 if again else 0,
             # packed fibers near the load at which they buckle would answer contact without bounds
             1 if self.contact is not None and self.contact.packed else 0,

@@ -52,6 +52,7 @@ class PairSearch:
         self.scene, self.model, self.state = scene, model, state
         self.pair_cost = pair_cost
         self.seconds = self.prune_seconds = 0.0  # spent on builds and pruning, on pruning alone
+        self.prune_count = 0  # beside those of builds
         self.radius = max(row["radius"] for row in model.group_rows)
         skin = START_SKIN * 2.0 * self.radius
         if scene.numerics.skin is not None:
@@ -193,10 +194,10 @@ class PairSearch:
         if pruning is None or self.list.margin == 0.0:
             return False
         begin = time.perf_counter()
-        holds = pruning.holds()
+        holds = pruning.prune()
         if holds:
-            pruning.prune()
             self.skin.wear(step)
+            self.prune_count += 1
         taken = time.perf_counter() - begin
         self.seconds += taken
         self.prune_seconds += taken
@@ -232,7 +233,7 @@ class PairSearch:
         if pairs.pruning is not None:
             wide = choice.skin + pairs.margin
             report |= {"wide_skin_diameters": round(wide / diameter, 4)}
-            report |= {"prunes": pairs.pruning.count - pairs.build_count}
+            report |= {"prunes": self.prune_count}
         return report | pairs.search_counts()
 
     def close(self) -> None:

@@ -36,6 +36,7 @@ from warpfiber.scene import Fault, Scene, SceneError, Stage
 from warpfiber.scene.containers import container
 from warpfiber.scene.derived import fiber_volume
 from warpfiber.scene.gripping import GRIPPING, HEIGHT
+from warpfiber.scene.planes import free_planes
 from warpfiber.scene.pouring import UP
 from warpfiber.scene.pressing import PRESSING, pressed_axis, wall_side
 
@@ -61,6 +62,9 @@ class Press:
             assert round_wall.center is not None and round_wall.radius is not None
             side = np.array([*round_wall.center[:2], round_wall.radius]) / model.units.length
             places = np.concatenate([places, side[None]])
+        for plane in free_planes(scene):  # inwards, and a point
+            point = np.asarray(plane.position) / model.units.length
+            places = np.concatenate([places, [plane.normal, point]])
         self.place = wp.array(places, dtype=wp.vec3d, device=device)
         metered = int(self.axis >= 0)
         fibers = metered * model.fiber_count
@@ -122,7 +126,9 @@ class Press:
             return
         velocity, servo = np.zeros((1, 2)), _led()
         if stage.kind in GRIPPING and self.axis == HEIGHT:
-            self._set_places(np.array([self.place.numpy()[0], self.corners[1]]))
+            place = self.place.numpy()
+            place[1] = self.corners[1]
+            self._set_places(place)
         if stage.kind in PRESSING:
             side = wall_side(stage)
             inward = 1.0 - 2.0 * side

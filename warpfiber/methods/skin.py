@@ -36,7 +36,7 @@ LARGEST_CHANGE = 1.5  # of one build
 LASTING = 1.3  # uses of a step that a skin must have room for
 # of a wide list: of a piece, of what it finds around it at the first skin, of a listed pair
 WIDE_PIECE, WIDE_NEAR, WIDE_PAIR = 64.0, 121.0, 35.0
-PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 8.0  # of a pair of the wide list, of a segment beside
+PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 12.0  # of a pair of the wide list, of a segment beside
 START_TIMES, MOST_PRUNED = 2, 12  # skins used up before cells are searched again
 UNEVEN = 1.1  # what a wide list holds more, since skins are used up unevenly
 MEMORY = 0.5  # weight of the use before in the mean

@@ -10,7 +10,7 @@ import warp as wp
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.kernel_module import kernel_module
-from warpfiber.passes.native import LANES
+from warpfiber.passes.native import LANES, PREFETCH_NODES, PREFETCH_SHARED
 from warpfiber.passes.native_nodes import (
     fiber_blocks,
     make_native_node_sweep,
@@ -108,9 +108,14 @@ def pair_launch(chain: BeadChain) -> Launch:
     if chain.native:
         kernel = make_native_pair_sweep(p.name, chain.pair_features)
         chunks = native_chunks(model.segment_count)
-        return Launch("pairs", kernel, chunks, [chunks, *inputs], split=True)
+        return Launch("pairs", kernel, chunks, [chunks, _ahead(chain), *inputs], split=True)
     kernel = make_pair_sweep(p.name, chain.pair_features)
     return Launch("pairs", kernel, pairs.pair_capacity, inputs, split=True)
+
+
+def _ahead(chain: BeadChain) -> int:
+    """Nodes from which sweeps ask for memory before they need it."""
+    return PREFETCH_NODES if chain.workers == 1 else PREFETCH_SHARED
 
 
 def _lubrication_dt(chain: BeadChain) -> float:
@@ -157,6 +162,7 @@ def native_node_launch(chain: BeadChain) -> Launch:
     fibers, own = fiber_blocks(model.host["fiber_group"], LANES[name])
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     inputs = [
+        _ahead(chain),
         *_node_inputs(chain),
         pairs.pair_i if pairs else none_i,
         pairs.pair_j if pairs else none_i,

@@ -14,7 +14,7 @@ from warpfiber.laws.bond import make_bond
 from warpfiber.laws.hertz import make_hertz
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.node_walls import CONTAINER, SIDES, make_concave
+from warpfiber.passes.node_walls import CONTAINER, CORNERS, SIDES, make_concave
 
 # Columns; those of walls are zero without them.
 ENERGIES = (
@@ -35,6 +35,7 @@ def make_measure_bonds(
     walls: tuple[bool, bool, bool],
     has_friction: bool = False,
     has_container: bool = False,
+    planes: int = 0,
 ):
     """Kernel `measure_bonds`: energies (F, len(ENERGIES)) of the present state."""
     p = precision(name)
@@ -43,7 +44,8 @@ def make_measure_bonds(
     _, bond_energies, _ = make_bond(name)
     plane_stiffness, _, plane_energy = make_hertz(name)
     wall_x, wall_y, wall_z = walls
-    has_walls = any(walls) or has_container
+    has_walls = any(walls) or has_container or planes > 0
+    sides, first_plane = SIDES + planes, CORNERS + has_container
     container_gap, inside_radius = make_concave(name)
     half_real = real(0.5)
 
@@ -58,10 +60,8 @@ def make_measure_bonds(
     def walls_energy(
         g: BondGroup,
         x: wp.vec3d,
-        low: wp.vec3d,
-        high: wp.vec3d,
-        side: wp.vec3d,
         i: wp.int32,
+        wall_place: wp.array(dtype=wp.vec3d),
         wall_memory: wp.array(dtype=vec3),
     ) -> wp.vec2d:
         """Of the pushes of all walls on a node, and of their friction."""
@@ -73,21 +73,30 @@ def make_measure_bonds(
             if axis == 2:
                 has_wall = wp.static(wall_z)
             if has_wall:
-                below = g.radius - real(x[axis] - low[axis])
-                above = g.radius - real(high[axis] - x[axis])
+                below = g.radius - real(x[axis] - wall_place[0][axis])
+                above = g.radius - real(wall_place[1][axis] - x[axis])
                 energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, below))
                 energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, above))
                 if wp.static(has_friction):
-                    slot = wp.static(SIDES) * i + 2 * axis
+                    slot = wp.static(sides) * i + 2 * axis
                     energy[1] += rubbed_energy(g, g.radius, below, wall_memory[slot])
                     energy[1] += rubbed_energy(g, g.radius, above, wall_memory[slot + 1])
         if wp.static(has_container):
-            radius = inside_radius(g.radius, side)
-            depth = g.radius - container_gap(x, side)[3]
+            radius = inside_radius(g.radius, wall_place[2])
+            depth = g.radius - container_gap(x, wall_place[2])[3]
             energy[0] += wp.float64(plane_energy(g.wall_modulus, radius, depth))
             if wp.static(has_friction):
-                h = wall_memory[wp.static(SIDES) * i + wp.static(CONTAINER)]
+                h = wall_memory[wp.static(sides) * i + wp.static(CONTAINER)]
                 energy[1] += rubbed_energy(g, radius, depth, h)
+        if wp.static(planes > 0):
+            for k in range(wp.static(planes)):
+                inwards = wall_place[wp.static(first_plane) + 2 * k]
+                away = x - wall_place[wp.static(first_plane) + 2 * k + 1]
+                into = g.radius - real(wp.dot(away, inwards))
+                energy[0] += wp.float64(plane_energy(g.wall_modulus, g.radius, into))
+                if wp.static(has_friction):
+                    kept = wall_memory[wp.static(sides) * i + wp.static(SIDES) + k]
+                    energy[1] += rubbed_energy(g, g.radius, into, kept)
         return energy
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -125,12 +134,7 @@ def make_measure_bonds(
             kinetic += half * (moving + inertia * wp.length_sq(wp.vec3d(node_spin[i])))
             gravity -= mass * wp.dot(wp.vec3d(g.weight), place[i] - middle)
             if wp.static(has_walls):
-                side = wp.vec3d()
-                if wp.static(has_container):
-                    side = wall_place[2]
-                wall += walls_energy(
-                    g, place[i], wall_place[0], wall_place[1], side, i, wall_memory
-                )
+                wall += walls_energy(g, place[i], i, wall_place, wall_memory)
             j = i + 1
             if i == last:
                 j = first

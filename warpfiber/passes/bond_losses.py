@@ -16,7 +16,7 @@ from warpfiber.laws.hertz import DASHPOT, make_hertz
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import SETTLING, BondFeatures
-from warpfiber.passes.node_walls import CONTAINER, SIDES, make_concave
+from warpfiber.passes.node_walls import CONTAINER, CORNERS, SIDES, make_concave
 
 LOST = ("bonds", "settling", "walls", "wall friction", "drive")  # columns
 
@@ -33,7 +33,8 @@ def make_bond_losses(name: str, features: BondFeatures):
     _, friction_force = make_friction(name)
     wall_x, wall_y, wall_z = features.walls
     has_walls, has_friction = any(features.walls), features.wall_friction
-    has_container = features.container
+    has_container, planes = features.container, features.planes
+    sides, first_plane = SIDES + planes, CORNERS + has_container
     container_gap, inside_radius = make_concave(name)
     has_dashpots = features.dashpots
     zero, half = real(0.0), real(0.5)
@@ -173,7 +174,7 @@ def make_bond_losses(name: str, features: BondFeatures):
                             approach = zero
                             if axis == press:
                                 approach = n[axis] * real(wall_velocity[0][side_of])
-                            slot = wp.static(SIDES) * i + 2 * axis + side_of
+                            slot = wp.static(sides) * i + 2 * axis + side_of
                             loss, slid, drive = wall_loss(
                                 g,
                                 wall_damping,
@@ -204,11 +205,32 @@ def make_bond_losses(name: str, features: BondFeatures):
                     side[3],
                     inside_radius(g.radius, wall_place[2]),
                     zero,
-                    wp.static(SIDES) * i + wp.static(CONTAINER),
+                    wp.static(sides) * i + wp.static(CONTAINER),
                     wall_memory,
                 )
                 at_walls += wp.float64(loss)
                 rubbed += wp.float64(slid)
+            if wp.static(planes > 0):
+                for k in range(wp.static(planes)):
+                    inwards = wall_place[wp.static(first_plane) + 2 * k]
+                    away = now.x - wall_place[wp.static(first_plane) + 2 * k + 1]
+                    loss, slid, drive = wall_loss(
+                        g,
+                        wall_damping,
+                        wall_face[wp.static(SIDES) + k],
+                        mass,
+                        amid,
+                        now,
+                        vec3(inwards),
+                        real(wp.dot(away, inwards)),
+                        g.radius,
+                        zero,
+                        wp.static(sides) * i + wp.static(SIDES) + k,
+                        wall_memory,
+                    )
+                    at_walls += wp.float64(loss)
+                    rubbed += wp.float64(slid)
+                    driven += wp.float64(drive)
         lost[fiber, 0] = lost[fiber, 0] + dt * in_bonds
         lost[fiber, 1] = lost[fiber, 1] + dt * in_settling
         lost[fiber, 2] = lost[fiber, 2] + dt * at_walls

@@ -37,7 +37,13 @@ class BondFeatures:
     wall_friction: bool = False
     press: int = -1  # axis whose walls may move and are metered
     container: bool = False  # a cylinder around the fibers
+    planes: int = 0  # beside those of the box
     grips: bool = False  # what acts on the nodes of grips is told; needs `loads`
+
+    @property
+    def walled(self) -> bool:
+        """Whether there is any wall."""
+        return any(self.walls) or self.container or self.planes > 0
 
 
 @cache
@@ -53,10 +59,15 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     bond_loads, _, bond_dashpots = make_bond(name)
     turned = make_rotation(name)
     wall_loads = make_node_walls(
-        name, features.walls, features.wall_friction, features.press, features.container
+        name,
+        features.walls,
+        features.wall_friction,
+        features.press,
+        features.container,
+        features.planes,
     )
     gather_pairs = make_gather(name)
-    has_walls, is_metered = any(features.walls) or features.container, features.press >= 0
+    has_walls, is_metered = features.walled, features.press >= 0
     has_dashpots, has_loads = features.dashpots, features.loads
     has_rings, has_pairs = features.closed, features.pairs
     has_grips = features.grips

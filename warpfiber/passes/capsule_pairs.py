@@ -13,13 +13,14 @@ from functools import cache
 
 import warp as wp
 
+from warpfiber.laws.capsule_contact import ALIGNED
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.contact_memory import make_hand_over
-from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
+from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
 
 
@@ -37,18 +38,19 @@ class CapsuleFeatures:
 def make_capsule_pairs(name: str, features: CapsuleFeatures):
     """Kernel `capsule_pairs`: what every listed pair does now; memories move on by dt."""
     p = precision(name)
-    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
+    real, vec2, vec3, vec4, mat33 = p.real, p.vec2, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
     normal_contact = make_capsule_touch(name, features.periodic, False, features.closed)
-    _, _, _, node_after, _, segment_over = make_ring_nodes(features.closed)
+    _, has_after, _, node_after, _, segment_over = make_ring_nodes(features.closed)
     neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
     has_dashpot, has_friction = features.dashpot, features.friction
     is_closed = features.closed
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
+    near, aligned = real(END_TOLERANCE[name]), real(ALIGNED)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -72,6 +74,24 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         v = (one - s) * node_velocity[node] + s * node_velocity[end]
         w = (one - s) * node_spin[node] + s * node_spin[end]
         return v, w
+
+    @wp.func
+    def is_next(
+        gi: BondGroup,
+        gj: BondGroup,
+        at_i: wp.int32,
+        at_j: wp.int32,
+        st: vec2,
+        a: vec3,
+        b: vec3,
+    ) -> wp.bool:
+        """Whether the next segment has the contact, at a glance: most that do not act end here."""
+        ab = wp.dot(a, b)
+        if ab * ab > aligned * wp.length_sq(a) * wp.length_sq(b):
+            return False
+        if st[0] >= one - near and has_after(at_i, gi.segments, ring_of(gi)):
+            return True
+        return st[1] >= one - near and has_after(at_j, gj.segments, ring_of(gj))
 
     @wp.func
     def inverse_mass(g: BondGroup, at: wp.int32, s: real) -> real:
@@ -107,6 +127,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
+        pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
         pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
@@ -144,8 +165,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 fiber_j = segment_fiber[j]
                 other = groups[fiber_group[fiber_j]]
                 reach = gi.radius + other.radius
-                if wp.length_sq(c) < reach * reach:
-                    at = node_j - fiber_node_start[fiber_j]
+                at = node_j - fiber_node_start[fiber_j]
+                if wp.length_sq(c) < reach * reach and not is_next(gi, other, at_i, at, st, a, b):
                     push, depth, _energy = normal_contact(
                         gi, other, at_i, at, node_i, node_j, delta, a, b, st, node_pos
                     )
@@ -209,6 +230,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_step[now & 1, k] = now
             force -= size * n
             pair_acts[k] = wp.uint8(1)
+            pair_push_out[k] = push[0]
             pair_force_out[k] = force
             pair_moment_out[k] = wp.cross(n, force)
             pair_arms_out[k] = vec4(s, t, arm_i, arm_j)

@@ -16,6 +16,7 @@ import warp as wp
 from warpfiber.model import HALT, precision
 from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.crossing import PLANAR, make_crossing
+from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
@@ -32,6 +33,7 @@ class CheckFeatures:
     shifted: bool = False  # it is known how near pairs come but for contact, and what that adds
     again: bool = False  # twice
     arrays: bool = False  # some walls are arrays of fibers
+    tears: bool = False  # a step that tears a segment is as one that ends nowhere
 
 
 @cache
@@ -48,6 +50,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
     has_arrays = features.arrays
     zero = real(0.0)
     lost = real(1e30)
+    tear2 = real(TEAR_STRETCH * TEAR_STRETCH)
     periodic = features.periodic
     has_walls = any(features.walls)
     options = {"module": module, "enable_backward": False, "grid_stride": False}
@@ -81,7 +84,10 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         crossed_out: wp.array(dtype=wp.int32),
         crossed_partner_out: wp.array(dtype=wp.int32),
     ):
-        """Largest overlap of a segment, and how many it passed through; a wall is partner -1."""
+        """Largest overlap of a segment, and how many it passed through; a wall is partner -1.
+
+        A segment that tore, or is nowhere, overlaps without end.
+        """
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
@@ -95,7 +101,11 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         partner = wp.int32(-1)
         crossed = wp.int32(0)
         crossed_partner = wp.int32(-1)
-        if not (wp.length_sq(xi) < lost and wp.length_sq(a) < lost):
+        longest2 = lost
+        if wp.static(features.tears):
+            rest = groups[fiber_group[segment_fiber[i]]].rest
+            longest2 = tear2 * rest * rest
+        if not (wp.length_sq(xi) < lost and wp.length_sq(a) < longest2):
             largest = lost
         mine = zero
         if wp.static(features.shifted):

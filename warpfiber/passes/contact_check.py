@@ -30,10 +30,11 @@ class ContactCheck:
     """What a step did: read `largest`, `found` and `list_short` after the launches.
 
     `largest` (1) float64: largest overlap at the end of the step, radii (0: none); 1e30 where a
-    position is not finite. `found` (5) int32: how many pairs passed through each other and nodes
-    through walls; segment and partner of the largest overlap; segment and partner of a crossing
-    (-1: none, as a partner a wall). `list_short` (1) int32: 1 if the list may miss a pair that
-    is within its reach where the step would end; `list_use` (1) vec3: see `list_bound`.
+    position is not finite, with `tears` where a segment is longer than it may be. `found` (5)
+    int32: how many pairs passed through each other and nodes through walls; segment and partner of
+    the largest overlap; segment and partner of a crossing (-1: none, as a partner a wall).
+    `list_short` (1) int32: 1 if the list may miss a pair that is within its reach where the step
+    would end; `list_use` (1) vec3: see `list_bound`.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class ContactCheck:
         lattice_now: Any,
         fiber_frozen: Any = None,
         solves: Sequence[tuple[ContactRows, ContactDual]] = (),
+        tears: bool = False,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
         self.solves = solves
@@ -62,6 +64,7 @@ class ContactCheck:
             shifted=len(solves) > 0,
             again=len(solves) > 1,
             arrays=bool(domain.arrays),
+            tears=tears,
         )
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))

@@ -113,21 +113,53 @@ def make_hand_over(name: str, closed: bool = False):
 
 @cache
 def make_carry_memory(name: str, has_friction: bool):
-    """Kernel `carry_memory`: what pairs of the list before had, for the pairs of the new one."""
+    """Kernels `keep_memory`, before a list is built, and `carry_memory`, after it.
+
+    What the pairs of a segment had that acted is packed at the begin of its row of the old list.
+    """
     p = precision(name)
     vec3, vec4 = p.vec3, p.vec4
+    options = {"module": "unique", "enable_backward": False, "grid_stride": False}
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(**options)
+    def keep_memory(
+        step: wp.array(dtype=wp.int64),
+        out_start: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
+        pair_image: wp.array(dtype=wp.int32),
+        acts: wp.array(dtype=wp.uint8),
+        force: wp.array(dtype=vec3),
+        arms: wp.array(dtype=vec4),
+        memory: wp.array2d(dtype=vec4),
+        written: wp.array2d(dtype=wp.int32),
+        kept_start_out: wp.array(dtype=wp.int32),
+        kept_count_out: wp.array(dtype=wp.int32),
+        kept_j_out: wp.array(dtype=wp.int32),
+        kept_image_out: wp.array(dtype=wp.int32),
+        kept_force_out: wp.array(dtype=vec3),
+        kept_arms_out: wp.array(dtype=vec4),
+        kept_memory_out: wp.array(dtype=vec4),
+        kept_step_out: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        side = wp.int32(step[0]) & 1
+        found = out_start[i]
+        kept_start_out[i] = found
+        for k in range(out_start[i], out_start[i + 1]):
+            if acts[k] != wp.uint8(0):
+                kept_j_out[found] = pair_j[k]
+                kept_image_out[found] = pair_image[k]
+                kept_force_out[found] = force[k]
+                kept_arms_out[found] = arms[k]
+                if wp.static(has_friction):
+                    kept_memory_out[found] = memory[side, k]
+                    kept_step_out[found] = written[side, k]
+                found += 1
+        kept_count_out[i] = found - out_start[i]
+
+    @wp.kernel(**options)
     def carry_memory(
         step: wp.array(dtype=wp.int64),
-        old_start: wp.array(dtype=wp.int32),
-        old_j: wp.array(dtype=wp.int32),
-        old_image: wp.array(dtype=wp.int32),
-        old_acts: wp.array(dtype=wp.uint8),
-        old_force: wp.array(dtype=vec3),
-        old_arms: wp.array(dtype=vec4),
-        old_memory: wp.array2d(dtype=vec4),
-        old_step: wp.array2d(dtype=wp.int32),
         out_start: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -135,34 +167,37 @@ def make_carry_memory(name: str, has_friction: bool):
         force_out: wp.array(dtype=vec3),
         arms_out: wp.array(dtype=vec4),
         memory_out: wp.array2d(dtype=vec4),
-        step_out: wp.array2d(dtype=wp.int32),
+        written_out: wp.array2d(dtype=wp.int32),
+        kept_start: wp.array(dtype=wp.int32),
+        kept_count: wp.array(dtype=wp.int32),
+        kept_j: wp.array(dtype=wp.int32),
+        kept_image: wp.array(dtype=wp.int32),
+        kept_force: wp.array(dtype=vec3),
+        kept_arms: wp.array(dtype=vec4),
+        kept_memory: wp.array(dtype=vec4),
+        kept_step: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        last = wp.int32(step[0])
-        side = last & 1
+        side = wp.int32(step[0]) & 1
         for k in range(out_start[i], out_start[i + 1]):
-            acts = wp.uint8(0)
-            written = wp.int32(wp.static(NEVER))
-            memory = vec4()
-            for m in range(old_start[i], old_start[i + 1]):
-                if old_acts[m] != wp.uint8(0):
-                    if old_j[m] == pair_j[k] and old_image[m] == pair_image[k]:
-                        acts = wp.uint8(1)
-                        force_out[k] = old_force[m]
-                        arms_out[k] = old_arms[m]
-                        if wp.static(has_friction):
-                            memory = old_memory[side, m]
-                            written = old_step[side, m]
-            acts_out[k] = acts
+            acts_out[k] = wp.uint8(0)
             if wp.static(has_friction):
-                memory_out[side, k] = memory
-                step_out[side, k] = written
+                written_out[side, k] = wp.int32(wp.static(NEVER))
+        for m in range(kept_start[i], kept_start[i] + kept_count[i]):
+            for k in range(out_start[i], out_start[i + 1]):
+                if pair_j[k] == kept_j[m] and pair_image[k] == kept_image[m]:
+                    acts_out[k] = wp.uint8(1)
+                    force_out[k] = kept_force[m]
+                    arms_out[k] = kept_arms[m]
+                    if wp.static(has_friction):
+                        memory_out[side, k] = kept_memory[m]
+                        written_out[side, k] = kept_step[m]
 
-    return carry_memory
+    return keep_memory, carry_memory
 
 
-def carry_memories(
-    kernel: Any, segments: int, step: Any, before: list[Any], after: list[Any], device: str
+def launch_memories(
+    kernel: Any, segments: int, step: Any, listed: list[Any], kept: list[Any], device: str
 ) -> None:
-    """Launch `carry_memory` over all segments; arrays of the list before and of the new one."""
-    wp.launch(kernel, dim=segments, inputs=[step, *before, *after], device=device)
+    """Launch one of them over all segments: arrays of the list, and what is kept."""
+    wp.launch(kernel, dim=segments, inputs=[step, *listed, *kept], device=device)

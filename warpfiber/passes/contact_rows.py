@@ -26,6 +26,7 @@ from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
 
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
+NEVER = -1e20  # radii: no gap is that small
 GROWTH = 1.3
 
 
@@ -37,7 +38,8 @@ class ContactRows:
     pair k the `pair_row_count[k]` from `pair_row[k]` on, `pair_clear` what its center lines surely
     stay apart without contact; `row_count` (1) in all, `row_need` (1) is 0 unless they do not fit.
     `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
-    where it would end without them unless given.
+    where it would end without them unless given. Free ends with a gap below `near_now` at the
+    start have rows whatever is foreseen, places inside a fiber below half of it.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class ContactRows:
         step_size: Any,
         node_foreseen: Any = None,
         keep: float = KEEP,
+        near_now: float = NEVER,
         lubrication: str = "none",
         capacity: int | None = None,
     ) -> None:
@@ -60,7 +63,7 @@ class ContactRows:
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         self.foresees = node_foreseen is not None
         self.node_foreseen = node_foreseen if self.foresees else state.node_pos
-        self.keep = keep
+        self.keep, self.near_now = keep, near_now
         domain = model.domain
         self.features = RowFeatures(
             any(domain.periodic), domain.wall, lubrication, bool(domain.arrays)
@@ -216,6 +219,7 @@ class ContactRows:
         widest = max(row["radius"] for row in self.model.group_rows)
         return [
             real(self.keep),
+            real(self.near_now),
             real(widest),
             *self._walls(),
             *self._fibers(),
@@ -232,6 +236,7 @@ class ContactRows:
         state = self.state
         return [
             self.model.precision.real(self.keep),
+            self.model.precision.real(self.near_now),
             *self._walls(),
             *self._fibers(),
             state.fiber_image,

@@ -223,8 +223,20 @@ class Measurement:
         i, j, image = pairs.host_pairs()
         fiber = self.model.host["segment_fiber"]
         touching = (touches[: len(i)] != 0) & (fiber[i] != fiber[j])
-        keys = np.stack([fiber[i[touching]], fiber[j[touching]], image[touching]], axis=1)
-        return 2.0 * len(np.unique(keys, axis=0)) / self.counted
+        keys = fiber_pair_keys(fiber[i[touching]], fiber[j[touching]], image[touching])
+        return 2.0 * len(np.unique(keys)) / self.counted
+
+
+def fiber_pair_keys(first: np.ndarray, second: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """(n,) a number for every pair of fibers and its image, the same for the same pair.
+
+    Numbers are sorted several times faster than rows.
+    """
+    fibers = 1 + int(second.max(initial=0))
+    images = 1 + int(np.ptp(image)) if len(image) else 1
+    shift = image.astype(np.int64) - (int(image.min()) if len(image) else 0)
+    keys: np.ndarray = (first.astype(np.int64) * fibers + second) * images + shift
+    return keys
 
 
 def measure_fiber_terms(

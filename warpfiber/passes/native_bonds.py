@@ -41,7 +41,7 @@ def native_bonds_apply(model: Model, features: BondFeatures) -> bool:
     """Whether the native sweep can do this model and is the faster one."""
     if not model.device.startswith("cpu") or features.closed or not features.pairs:
         return False
-    if features.container:
+    if features.container or features.planes:
         return False
     nodes = np.diff(model.host["fiber_node_start"])
     if nodes.min() < LEAST_NODES or nodes.max() > MOST_NODES:

@@ -10,6 +10,7 @@ Symbols: as in `capsule_contact`; a, b edges of the two segments, delta from sta
 import math
 
 from warpfiber.laws.capsule_contact import (
+    ALIGNED,
     LINE_COSINE,
     LINE_PART,
     POWER,
@@ -18,7 +19,6 @@ from warpfiber.laws.capsule_contact import (
 )
 from warpfiber.passes.pairs import END_TOLERANCE
 
-ALIGNED = LINE_COSINE**2 * (1.0 - 1e-5)  # squared cosine below which no pair can be a line
 # Terms of log((1 + f) / (1 - f)) up to f = 3 - sqrt(8), and of exp up to half a binary digit.
 LOG_TERMS = {"float64": 11, "float32": 5}
 EXP_TERMS = {"float64": 14, "float32": 8}

@@ -235,6 +235,7 @@ _LAW = """
             }
             if (keeps) {
                 pair_acts[k] = 1;
+                pair_push[k] = ((const T*)&force)[l];
                 T* f = (T*)pair_force + 3 * k;
                 T* m = (T*)pair_moment + 3 * k;
                 T* arms = (T*)pair_arms + 4 * k;

@@ -59,7 +59,10 @@ def native_nodes_apply(model: Model, features: NodeFeatures) -> bool:
 
 @cache
 def make_native_node_sweep(name: str, features: NodeFeatures, module: str = "unique"):
-    """Kernel `native_node_sweep` over blocks of fibers."""
+    """Kernel `native_node_sweep` over blocks of fibers.
+
+    From `fetch_from` nodes on, what the next block needs is asked for.
+    """
     p = precision(name)
     real, vec2, vec3, mat33 = p.real, p.vec2, p.vec3, p.mat33
     Group = group_struct(name)
@@ -68,6 +71,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures, module: str = "uni
     @wp.func_native(snippet)
     def sweep_block(
         block: wp.int32,
+        fetch_from: wp.int32,
         dt: real,
         flow_origin: vec3,
         wall_low: vec3,
@@ -102,6 +106,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures, module: str = "uni
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def native_node_sweep(
         offset: wp.int32,
+        fetch_from: wp.int32,
         dt: real,
         flow_origin: vec3,
         wall_low: vec3,
@@ -135,6 +140,7 @@ def make_native_node_sweep(name: str, features: NodeFeatures, module: str = "uni
     ):
         sweep_block(
             wp.tid() + offset,
+            fetch_from,
             dt,
             flow_origin,
             wall_low,

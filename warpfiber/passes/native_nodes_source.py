@@ -12,7 +12,7 @@ import math
 from warpfiber.laws.bending import SMALLEST_SINE, bending_series
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
-from warpfiber.passes.native import LANES, PREFETCH_NODES, lane_types, transpose
+from warpfiber.passes.native import LANES, lane_types, transpose
 from warpfiber.passes.nodes import TEAR_STRETCH, NodeFeatures
 
 # Terms of the bending series up to a right angle, multiples of four: errors 2e-17 and 3e-10.
@@ -41,7 +41,6 @@ def _constants(name: str, features: NodeFeatures) -> str:
     terms = SERIES_TERMS[name]
     series = ", ".join(f"T({value!r})" for value in bending_series(1.0, terms))
     lines.append(f"constexpr int TERMS = {terms};")
-    lines.append(f"constexpr int PREFETCH_NODES = {PREFETCH_NODES};")
     lines.append(f"constexpr T SERIES[TERMS] = {{{series}}};")
     slots = {
         "SLOT_EXPIRED": EXPIRED,
@@ -300,7 +299,7 @@ _STEP = """
 # Fibers that a cache does not hold are asked for one block ahead: rows of many fibers at once are
 # more streams than the processor follows by itself.
 _PREFETCH = """
-    if (node_count > PREFETCH_NODES && block + 1 < block_count) {
+    if (node_count > fetch_from && block + 1 < block_count) {
         const int* ahead = fiber + W;
         for (int l = 0; l < W; ++l) {
             const long begin = 3L * fiber_node_start[ahead[l]];

@@ -18,7 +18,6 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import HALT, PAIR_COUNT, precision
-from warpfiber.passes.native import PREFETCH_NODES
 from warpfiber.passes.native_beads import squeeze_text
 from warpfiber.passes.pairs import (
     IMAGE_BITS,
@@ -104,7 +103,7 @@ NEAR_PAIRS = Template("""
         b = transpose(rows_b);
         delta = transpose(rows_delta);
     };
-    if (node_pos.shape[0] > $prefetch_nodes) {
+    if (node_pos.shape[0] > fetch_from) {
         // what a cache does not hold is asked for two blocks ahead, its addresses four ahead
         const int capacity = pair_j.shape[0];
         for (int k = first + 2 * 64; k < first + 3 * 64 && k < capacity; ++k) {
@@ -154,7 +153,10 @@ def native_chunks(segment_count: int) -> int:
 
 
 def near_text(name: str, periodic: bool, *, head: str = "", fetch: str = "", rest: str) -> str:
-    """Statements that find the near ones of a block of pairs, up to what `rest` does with them."""
+    """Statements that find the near ones of a block of pairs, up to what `rest` does with them.
+
+    From `fetch_from` nodes on, what later blocks need is asked for.
+    """
     return NEAR_PAIRS.substitute(
         real={"float32": "float", "float64": "double"}[name],
         lanes=LANES,
@@ -163,7 +165,6 @@ def near_text(name: str, periodic: bool, *, head: str = "", fetch: str = "", res
         mask=(1 << IMAGE_BITS) - 1,
         half=1 << (IMAGE_BITS - 1),
         shift=SHIFT if periodic else "",
-        prefetch_nodes=PREFETCH_NODES,
         tiny="1.0e-30",
         eps=precision(name).eps,
         head=head,
@@ -191,6 +192,7 @@ def make_pair_block(name: str, features: PairFeatures):
     def pair_block(
         first: wp.int32,
         count: wp.int32,
+        fetch_from: wp.int32,
         dt: real,
         reach_bound: real,
         touch_bound: real,
@@ -233,6 +235,7 @@ def make_native_pair_sweep(name: str, features: PairFeatures):
     def native_pair_sweep(
         offset: wp.int32,
         chunks: wp.int32,
+        fetch_from: wp.int32,
         dt: real,
         strength: real,
         decay: real,
@@ -268,6 +271,7 @@ def make_native_pair_sweep(name: str, features: PairFeatures):
             left = pair_block(
                 first,
                 wp.min(total - first, wp.static(BLOCK)),
+                fetch_from,
                 dt,
                 reach_bound,
                 touch_share * reach_bound,

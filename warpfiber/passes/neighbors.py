@@ -88,7 +88,8 @@ class NeighborList:
         self.longest_rest = longest_rest
         self.stretch_allowed = max(FIRST_STRETCH, START_ROOM * stretch)
         self.row_capacity = row_capacity
-        self.pair_capacity = pair_capacity or max(64, 3 * model.segment_count // 2)
+        room = 1.5 if flow_origin is None else 3.0  # pairs per segment; a wide list has more
+        self.pair_capacity = pair_capacity or max(64, int(room * model.segment_count))
         self.workers = workers
         closed = len(model.segment_end) > 0
         self.native = model.device.startswith("cpu") if native is None else native

@@ -3,8 +3,8 @@
 Source: laws `hertz` and `friction`; walls are rigid. Those of axis `press` move along their normal,
     and what they push with is told. A container is a cylinder along z around the fibers: inside it
     R* = 1 / (1 / a - 1 / R).
-Symbols: places of walls: lower and upper corner, and of a container (x, y of its axis, R). Faces of
-    walls: friction, and the velocity in their planes.
+Symbols: places of walls: lower and upper corner, of a container (x, y of its axis, R), of other
+    planes (unit normal inwards, a point). Faces of walls: friction, velocity in their planes.
 """
 
 from functools import cache
@@ -16,8 +16,9 @@ from warpfiber.laws.hertz import DASHPOT, make_hertz
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 
-SIDES = 7  # places of a node's memories: axis by axis, low before high; the container
+SIDES = 7  # places of a node's memories: axis by axis, low before high; the container; other planes
 CONTAINER = 6
+CORNERS = 2  # places before those of a container and of other planes
 
 
 @cache
@@ -51,6 +52,7 @@ def make_node_walls(
     has_friction: bool,
     press: int,
     has_container: bool = False,
+    planes: int = 0,
 ):
     """`wall_loads`: force and moment of all walls on a node; memories move on by dt.
 
@@ -66,6 +68,7 @@ def make_node_walls(
     wall_x, wall_y, wall_z = walls
     zero, half = real(0.0), real(0.5)
     dashpot = real(DASHPOT)
+    sides, first_plane = SIDES + planes, CORNERS + has_container
 
     @wp.func
     def one_wall(
@@ -158,7 +161,7 @@ def make_node_walls(
                         gap,
                         g.radius,
                         approach,
-                        wp.static(SIDES) * i + 2 * axis + side,
+                        wp.static(sides) * i + 2 * axis + side,
                         memories,
                         depths,
                     )
@@ -179,12 +182,33 @@ def make_node_walls(
                 from_side[3],
                 inside_radius(g.radius, wall_place[2]),
                 zero,
-                wp.static(SIDES) * i + wp.static(CONTAINER),
+                wp.static(sides) * i + wp.static(CONTAINER),
                 memories,
                 depths,
             )
             force += push
             moment += couple
+        if wp.static(planes > 0):
+            for k in range(wp.static(planes)):
+                inwards = wall_place[wp.static(first_plane) + 2 * k]
+                away = node.x - wall_place[wp.static(first_plane) + 2 * k + 1]
+                push, couple, _other = one_wall(
+                    g,
+                    beta,
+                    faces[wp.static(SIDES) + k],
+                    dt,
+                    mass,
+                    node,
+                    vec3(inwards),
+                    real(wp.dot(away, inwards)),
+                    g.radius,
+                    zero,
+                    wp.static(sides) * i + wp.static(SIDES) + k,
+                    memories,
+                    depths,
+                )
+                force += push
+                moment += couple
         return force, moment, pushes
 
     return wall_loads

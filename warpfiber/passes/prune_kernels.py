@@ -40,7 +40,7 @@ KEEP = f"""
 
 @cache
 def make_wide_kernels(name: str, module: str = "unique"):
-    """`remember_wide`, `begin_test`, `test_wide`, `begin_prune`, `remember_nodes` by name."""
+    """`remember_wide`, `remember_nodes`, `begin_prune`, `place_nodes` by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     skin_limit = make_skin_limit(name)
@@ -60,50 +60,48 @@ def make_wide_kernels(name: str, module: str = "unique"):
         wide_total_out[0] = status[wp.static(PAIR_COUNT)]
 
     @wp.kernel(**options)
-    def begin_test(
+    def begin_prune(
         wide_sizes: wp.array(dtype=real),
+        lattice: wp.array(dtype=wp.mat33d),
+        list_lattice_out: wp.array(dtype=wp.mat33d),
+        prune_lattice_out: wp.array(dtype=mat33),
         deformation: wp.array(dtype=wp.mat33d),
         wide_deformation: wp.array(dtype=wp.mat33d),
         affine_out: wp.array(dtype=mat33),
         limit_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
     ):
-        affine = mat33(deformation[0] * wide_deformation[0])
+        """F since the build, and the square of the largest motion that the margin holds."""
+        list_lattice_out[0] = lattice[0]
+        prune_lattice_out[0] = mat33(lattice[0])
+        wide_deformation[0] = deformation[0] * wide_deformation[0]
+        deformation[0] = wp.identity(n=3, dtype=wp.float64)
+        affine = mat33(wide_deformation[0])
         limit = skin_limit(affine, wide_sizes[1], wide_sizes[0])
         affine_out[0] = affine
         limit_out[0] = limit * limit
         short_out[0] = wp.where(limit < real(0.0), 1, 0)
+        status[wp.static(EXPIRED)] = 0
 
     @wp.kernel(**options)
-    def test_wide(
+    def place_nodes(
         offset: wp.int32,
         flow_origin: vec3,
         affine: wp.array(dtype=mat33),
         limit: wp.array(dtype=real),
         wide_pos: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        list_pos_out: wp.array(dtype=vec3),
         short_out: wp.array(dtype=wp.int32),
     ):
         """`short` where the margin does not hold the motion of a node."""
         i = wp.tid() + offset
-        moved = node_pos[i] - flow_origin - affine[0] * (wide_pos[i] - flow_origin)
+        x = node_pos[i]
+        list_pos_out[i] = x
+        moved = x - flow_origin - affine[0] * (wide_pos[i] - flow_origin)
         if not (wp.length_sq(moved) <= limit[0]):
             short_out[0] = 1
-
-    @wp.kernel(**options)
-    def begin_prune(
-        lattice: wp.array(dtype=wp.mat33d),
-        list_lattice_out: wp.array(dtype=wp.mat33d),
-        prune_lattice_out: wp.array(dtype=mat33),
-        deformation: wp.array(dtype=wp.mat33d),
-        wide_deformation: wp.array(dtype=wp.mat33d),
-        status: wp.array(dtype=wp.int32),
-    ):
-        list_lattice_out[0] = lattice[0]
-        prune_lattice_out[0] = mat33(lattice[0])
-        wide_deformation[0] = deformation[0] * wide_deformation[0]
-        deformation[0] = wp.identity(n=3, dtype=wp.float64)
-        status[wp.static(EXPIRED)] = 0
 
     @wp.kernel(**options)
     def remember_nodes(
@@ -115,7 +113,7 @@ def make_wide_kernels(name: str, module: str = "unique"):
         pos_out[i] = node_pos[i]
 
     local = locals()
-    names = "remember_wide begin_test test_wide begin_prune remember_nodes"
+    names = "remember_wide remember_nodes begin_prune place_nodes"
     return {kernel: local[kernel] for kernel in names.split()}
 
 
@@ -131,6 +129,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
     def near_block(
         first: wp.int32,
         count: wp.int32,
+        fetch_from: wp.int32,
         reach_bound: real,
         segment_node: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
@@ -165,6 +164,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
     def mark_near(
         offset: wp.int32,
         workers: wp.int32,
+        fetch_from: wp.int32,
         list_sizes: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
@@ -188,6 +188,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
             bits = near_block(
                 first,
                 wp.min(total - first, wp.static(BLOCK)),
+                fetch_from,
                 list_sizes[0],
                 segment_node,
                 lattice,

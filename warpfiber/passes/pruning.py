@@ -24,6 +24,7 @@ import warp as wp
 from warpfiber.model import PAIR_COUNT
 from warpfiber.passes.executor import Call, Executor, Launch
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native import PREFETCH_NODES, PREFETCH_SHARED
 from warpfiber.passes.native_pairs import BLOCK
 from warpfiber.passes.prune_kernels import make_native_prune, make_plain_prune, make_wide_kernels
 
@@ -62,8 +63,7 @@ class Pruning:
         self.lattice = wp.zeros(1, dtype=p.mat33, device=device)
         self.affine = wp.zeros(1, dtype=p.mat33, device=device)
         self.limit = wp.zeros(1, dtype=p.real, device=device)
-        self._tests: Executor | None = None
-        self._prunes: Executor | None = None
+        self._executor: Executor | None = None
 
     def allocate(self, size: int) -> None:
         """Room for as many listed pairs."""
@@ -82,10 +82,9 @@ class Pruning:
 
     def close(self) -> None:
         """End the extra worker threads."""
-        for executor in (self._tests, self._prunes):
-            if executor is not None:
-                executor.close()
-        self._tests = self._prunes = None
+        if self._executor is not None:
+            self._executor.close()
+            self._executor = None
 
     def write_sizes(self) -> None:
         """Tell the kernels what the next wide list holds."""
@@ -112,25 +111,18 @@ class Pruning:
 
     # -- running ----------------------------------------------------------------------------------
 
-    def holds(self) -> bool:
-        """Whether the wide list still has every pair within reach and skin."""
-        if self._tests is None:
-            pairs = self.pairs
-            self._tests = Executor(
-                self._test_launches(), pairs.model.device, pairs.workers, single=True
-            )
-        self._tests.run(1, _never)
-        return not bool(self.short.numpy()[0])
+    def prune(self) -> bool:
+        """Keep the pairs of the present positions; False if the margin did not hold the motion.
 
-    def prune(self) -> None:
-        """Keep the pairs of the present positions."""
-        if self._prunes is None:
+        Then pairs may be missing, and a build is due.
+        """
+        if self._executor is None:
             pairs = self.pairs
-            self._prunes = Executor(
-                self._prune_launches(), pairs.model.device, pairs.workers, single=True
-            )
-        self._prunes.run(1, _never)
+            launches, device = self._launches(), pairs.model.device
+            self._executor = Executor(launches, device, pairs.workers, single=True)
+        self._executor.run(1, _never)
         self.count += 1
+        return not bool(self.short.numpy()[0])
 
     def begin(self) -> list[Launch | Call]:
         """Launches after those of a build."""
@@ -148,68 +140,51 @@ class Pruning:
                     self.wide_total,
                 ],
             ),
-            self._remember(self.wide_pos),
-        ]
-
-    def _remember(self, into: Any) -> Launch:
-        count, state = self.pairs.model.node_count, self.pairs.state
-        kernel = self.kernels["remember_nodes"]
-        return Launch("remember_nodes", kernel, count, [state.node_pos, into], split=True)
-
-    def _test_launches(self) -> list[Launch | Call]:
-        model, state = self.pairs.model, self.pairs.state
-        return [
             Launch(
-                "begin_test",
-                self.kernels["begin_test"],
-                1,
-                [
-                    self.wide_sizes,
-                    state.deformation,
-                    self.wide_deformation,
-                    self.affine,
-                    self.limit,
-                    self.short,
-                ],
-            ),
-            Launch(
-                "test_wide",
-                self.kernels["test_wide"],
-                model.node_count,
-                [
-                    model.precision.vec3(*self.flow_origin),
-                    self.affine,
-                    self.limit,
-                    self.wide_pos,
-                    state.node_pos,
-                    self.short,
-                ],
+                "remember_nodes",
+                self.kernels["remember_nodes"],
+                self.pairs.model.node_count,
+                [state.node_pos, self.wide_pos],
                 split=True,
             ),
         ]
 
-    def _prune_launches(self) -> list[Launch | Call]:
-        state = self.pairs.state
+    def _launches(self) -> list[Launch | Call]:
+        model, state = self.pairs.model, self.pairs.state
         begin = Launch(
             "begin_prune",
             self.kernels["begin_prune"],
             1,
             [
+                self.wide_sizes,
                 state.lattice,
                 state.list_lattice,
                 self.lattice,
                 state.deformation,
                 self.wide_deformation,
+                self.affine,
+                self.limit,
+                self.short,
                 state.status,
             ],
         )
+        origin = model.precision.vec3(*self.flow_origin)
+        place = [origin, self.affine, self.limit, self.wide_pos, state.node_pos, state.list_pos]
+        nodes = Launch(
+            "place_nodes",
+            self.kernels["place_nodes"],
+            model.node_count,
+            [*place, self.short],
+            split=True,
+        )
         keep = self._native_launches() if self.pairs.native else self._plain_launches()
-        return [begin, self._remember(state.list_pos), *keep]
+        return [begin, nodes, *keep]
 
     def _native_launches(self) -> list[Launch | Call]:
         pairs, model, state = self.pairs, self.pairs.model, self.pairs.state
         workers, wide = pairs.workers, (self.wide_i, self.wide_j, self.wide_image)
-        mark = [pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
+        ahead = PREFETCH_NODES if workers == 1 else PREFETCH_SHARED
+        mark = [ahead, pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
         keep = [model.segment_count, self.wide_total, self.near_bits, self.kept, *wide]
         listed = [pairs.pair_i, pairs.pair_j, pairs.pair_image]
         partners = [model.segment_count, state.status, pairs.pair_j, pairs.in_start, pairs.in_pair]
@@ -219,10 +194,12 @@ class Pruning:
             "keep_near": [*keep, pairs.out_start, *listed, state.status],
             "index_partners": [*partners, total],
         }
-        return [
+        launches: list[Launch | Call] = [
             Launch(name, self.kernels[name], workers, [workers, *values], split=True)
             for name, values in inputs.items()
         ]
+        launches[0].follows = True  # after what places nodes, which it does not read
+        return launches
 
     def _plain_launches(self) -> list[Launch | Call]:
         pairs, model, state = self.pairs, self.pairs.model, self.pairs.state

@@ -86,6 +86,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
     def count_rows(
         offset: wp.int32,
         keep: real,
+        near_now: real,
         widest: real,
         wall_low: vec3,
         wall_high: vec3,
@@ -108,7 +109,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
     ):
-        """`keep` in radii of the thinner fiber, `widest` the largest radius of all."""
+        """`keep`, `near_now` in radii of the thinner fiber, `widest` the largest radius of all."""
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
@@ -117,7 +118,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         a = node_back[node_i + 1] - xi
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
-        reach = (real(2.0) + keep) * widest
+        reach = (real(2.0) + wp.max(keep, near_now)) * widest
         looked_at = reach
         if wp.static(has_lubrication):
             looked_at = wp.max(reach, real(2.0) * outer * widest)
@@ -171,6 +172,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                             wb,
                             contact,
                             keep * arc,
+                            near_now * arc,
                             far,
                             arc,
                             node_i,
@@ -192,6 +194,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                             wb,
                             contact,
                             keep * arc,
+                            near_now * arc,
                             far,
                             arc,
                             node_i,
@@ -231,7 +234,8 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                                 if wall_array[2 * axis + side][1] > zero:
                                     continue
                             y = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
-                            if y - radius < keep * radius:
+                            now = wall_gap(node_back[node], axis, side, wall_low, wall_high)
+                            if y - radius < keep * radius or now - radius < near_now * radius:
                                 total += 1
             if wp.static(has_arrays):
                 moved = wp.max(wp.length(move_i), wp.length(move_i + wa))
@@ -245,7 +249,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                             side,
                             wall_low,
                             wall_high,
-                            (real(1.0) + keep) * radius + moved,
+                            (real(1.0) + wp.max(keep, near_now)) * radius + moved,
                         ):
                             continue
                         for place in range(2 * first, wp.static(PLACES)):
@@ -260,7 +264,8 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                                 shape,
                                 radius,
                             )
-                            if gap - wp.dot(normal, move_i + t * wa) < keep * radius:
+                            gap_next = gap - wp.dot(normal, move_i + t * wa)
+                            if gap_next < keep * radius or gap < near_now * radius:
                                 total += 1
         segment_rows_out[i] = total
 

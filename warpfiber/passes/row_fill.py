@@ -77,6 +77,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
     def fill_rows(
         offset: wp.int32,
         keep: real,
+        near_now: real,
         wall_low: vec3,
         wall_high: vec3,
         wall_array: wp.array(dtype=vec2),
@@ -222,7 +223,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 if wall_array[2 * axis + side][1] > zero:
                                     continue
                             gap = wall_gap(node_foreseen[node], axis, side, wall_low, wall_high)
-                            if gap - gi.radius < keep * gi.radius:
+                            now = wall_gap(node_back[node], axis, side, wall_low, wall_high)
+                            closes = gap - gi.radius < keep * gi.radius
+                            if closes or now - gi.radius < near_now * gi.radius:
                                 gap = wall_gap(node_pos[node], axis, side, wall_low, wall_high)
                                 normal = vec3(zero, zero, zero)
                                 normal[axis] = real(2 * side - 1)
@@ -259,7 +262,7 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                             side,
                             wall_low,
                             wall_high,
-                            (real(1.0) + keep) * gi.radius + moved,
+                            (real(1.0) + wp.max(keep, near_now)) * gi.radius + moved,
                         ):
                             continue
                         for place in range(2 * first, wp.static(PLACES)):
@@ -274,7 +277,8 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
                                 shape,
                                 gi.radius,
                             )
-                            if gap - wp.dot(normal, seen_i + t * seen_a) < keep * gi.radius:
+                            gap_next = gap - wp.dot(normal, seen_i + t * seen_a)
+                            if gap_next < keep * gi.radius or gap < near_now * gi.radius:
                                 base = gap - wp.dot(normal, move_i + t * wa)
                                 key = array_key(place, xi, xi + a, axis, side, wall_low, shape)
                                 row_i_out[r] = i

@@ -60,7 +60,7 @@ def make_row_geometry(name: str):
     p = precision(name)
     real, vec2, vec3 = p.real, p.vec2, p.vec3
     closest_points = make_closest_points(name)
-    zero, one = real(0.0), real(1.0)
+    zero, one, half = real(0.0), real(1.0), real(0.5)
     near = real(END_TOLERANCE[name])
     crossing = real(CROSSING[name])
     closer = real(CLOSER * CLOSER)
@@ -100,11 +100,31 @@ def make_row_geometry(name: str):
         return wp.normalize(normal), distance - contact
 
     @wp.func
-    def predicted_gap(
-        st: vec2, delta: vec3, a: vec3, b: vec3, w: vec3, wa: vec3, wb: vec3, contact: real
-    ) -> real:
+    def is_close(
+        st: vec2,
+        delta: vec3,
+        a: vec3,
+        b: vec3,
+        w: vec3,
+        wa: vec3,
+        wb: vec3,
+        contact: real,
+        keep: real,
+        near_now: real,
+    ) -> wp.bool:
+        """Predicted gap below `keep`, or the gap itself below `near_now`."""
         normal, gap = row_normal_gap(st, delta, a, b, contact)
-        return gap + wp.dot(normal, w + st[1] * wb - st[0] * wa)
+        return gap < near_now or gap + wp.dot(normal, w + st[1] * wb - st[0] * wa) < keep
+
+    @wp.func
+    def freedom(s: real, at: wp.int32, segments: wp.int32, least: real) -> real:
+        """1 at a free end of the fiber, `least` far from it."""
+        free = least
+        if at == 0:
+            free = wp.max(free, one - s)
+        if at == segments - 1:
+            free = wp.max(free, s)
+        return free
 
     @wp.func
     def is_joint(s: real, at: wp.int32, segments: wp.int32) -> wp.bool:
@@ -268,6 +288,7 @@ def make_row_geometry(name: str):
         wb: vec3,
         contact: real,
         keep: real,
+        near_now: real,
         far: real,
         arc: real,
         node_i: wp.int32,
@@ -278,12 +299,17 @@ def make_row_geometry(name: str):
         segments_j: wp.int32,
         nodes: wp.array(dtype=vec3),
     ) -> wp.int32:
-        """One bit per slot whose row counts and has a predicted gap below `keep`; st: slot 0."""
+        """One bit per slot whose row counts and is close (`is_close`); st: slot 0.
+
+        `near_now` is for free ends, which spring farthest; half of it inside a fiber.
+        """
         slots = wp.int32(0)
         # closest points at a joint are those of a node, which its owner reports
         has_first = not (is_joint(st[0], at_i, segments_i) or is_joint(st[1], at_j, segments_j))
         if has_first:
-            if predicted_gap(st, delta, a, b, w, wa, wb, contact) < keep:
+            free = freedom(st[1], at_j, segments_j, freedom(st[0], at_i, segments_i, half))
+            now = near_now * free
+            if is_close(st, delta, a, b, w, wa, wb, contact, keep, now):
                 slots = 1
         inverse_aa = one / wp.dot(a, a)
         inverse_bb = one / wp.dot(b, b)
@@ -298,7 +324,9 @@ def make_row_geometry(name: str):
             c = delta + place[1] * b - place[0] * a
             # most ends are far from the other fiber
             if wp.length_sq(c) < far * far:
-                if predicted_gap(place, delta, a, b, w, wa, wb, contact) < keep:
+                free = freedom(place[0], at_i, segments_i, half)
+                now = near_now * freedom(place[1], at_j, segments_j, free)
+                if is_close(place, delta, a, b, w, wa, wb, contact, keep, now):
                     if slot <= 2:
                         counts = is_counted_i(
                             slot,

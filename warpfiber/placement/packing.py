@@ -41,6 +41,7 @@ from warpfiber.placement.shapes import straight_nodes
 from warpfiber.placement.space import Cell, Container, Inserted
 from warpfiber.scene import Fault, Scene, SceneError
 from warpfiber.scene.containers import container
+from warpfiber.scene.planes import free_planes
 
 BATCH = 0.2
 """Part of all random fibers that goes in overlapping between two relaxations."""
@@ -104,7 +105,8 @@ def scene_cell(scene: Scene) -> Cell:
     if found is not None:
         assert found.radius is not None and found.height is not None
         around = Container(np.asarray(found.center), found.radius, found.height)
-    return Cell(size, kinds == "periodic", kinds == "wall", around)
+    planes = tuple((np.asarray(p.normal), np.asarray(p.position)) for p in free_planes(scene))
+    return Cell(size, kinds == "periodic", kinds == "wall", around, planes)
 
 
 def overlap_of(
@@ -182,7 +184,7 @@ class _Packing:
     def insert_given(self) -> None:
         """Fibers with given centers; a direction in the way of another fiber is drawn again."""
         for g in self.groups:
-            if g.given is None or self.cell.container is not None:
+            if g.given is None or self.cell.shaped:
                 continue
             for f in range(len(g.direction)):
                 draws = 0
@@ -205,10 +207,10 @@ class _Packing:
             self.held.append(g.capsules())
 
     def insert_shaped(self) -> None:
-        """Fibers that are not straight, or in a container, as rigid bodies at free places."""
+        """Fibers that are not straight, or within more than a box, as rigid bodies."""
         for g in self.groups:
             straight = self.scene.fibers[g.index].shape.kind == "straight"
-            if not g.nodes and (not straight or self.cell.container is not None):
+            if not g.nodes and (not straight or self.cell.shaped):
                 self.held.append(insert_shaped(self.scene, self.cell, g, self.held, self.rng))
 
     def insert_random(self) -> None:

@@ -136,8 +136,8 @@ class _Places:
         high = np.where(wall, size - keep - turned.max(axis=0), size)
         if given is not None:
             inside = bool(np.all((given >= low) & (given <= high) | ~wall))
-            if inside and self.cell.container is not None:
-                inside = bool(self.cell.container.holds((turned + given)[None], self.radius)[0])
+            if inside and self.cell.shaped:
+                inside = bool(self.cell.holds((turned + given)[None], self.radius)[0])
             return given[None] if inside else np.zeros((0, 3))
         if np.any(low > high):
             return np.zeros((0, 3))
@@ -149,8 +149,8 @@ class _Places:
                 np.minimum(high, around.center + half),
             )
         center = np.asarray(low + (high - low) * rng.random((TRIES, 3)))
-        if around is not None:
-            center = center[around.holds(turned + center[:, None], self.radius)]
+        if self.cell.shaped:
+            center = center[self.cell.holds(turned + center[:, None], self.radius)]
         return center
 
     def _free(self, turned: Floats, center: Floats) -> Floats | None:

@@ -47,6 +47,22 @@ class Cell:
     periodic: NDArray[np.bool_]
     wall: NDArray[np.bool_]
     container: Container | None = None
+    planes: tuple[tuple[Floats, Floats], ...] = ()
+    """of each its unit normal, inwards, and a point, m"""
+
+    @property
+    def shaped(self) -> bool:
+        """Whether there are more bounds than those of a box."""
+        return self.container is not None or bool(self.planes)
+
+    def holds(self, nodes: Floats, radius: float) -> NDArray[np.bool_]:
+        """Which fibers (m, nodes, 3) of this radius lie inside container and planes, (m,)."""
+        held = np.ones(len(nodes), dtype=bool)
+        if self.container is not None:
+            held &= self.container.holds(nodes, radius)
+        for normal, point in self.planes:
+            held &= ((nodes - point) @ normal).min(axis=1) >= wall_distance(radius)
+        return held
 
 
 def wall_distance(radius: float) -> float:
