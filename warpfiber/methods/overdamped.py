@@ -27,6 +27,7 @@ from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Executor, Launch
 from warpfiber.passes.held_nodes import make_carry_fibers
+from warpfiber.passes.native_chain import MOST_NODES, chain_blocks, make_native_chain
 from warpfiber.scene import Scene
 
 # Arrays that the next step depends on beside the State and those of every implicit method.
@@ -68,6 +69,11 @@ class Overdamped(Implicit):
                 self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
             self._make_contact(response, self.load)
         self.paced = self.contact is not None and self.contact.packed
+        # vectors know neither held nodes nor fibers that are carried whole
+        self.native = device.startswith("cpu") and self.stages == 2 and most <= MOST_NODES
+        self.native = self.native and self.node_hold.shape[0] == 0
+        blocks = chain_blocks(p.name, model.host["fiber_group"])
+        self.block_start = wp.array(blocks, dtype=wp.int32, device=device)
 
     # -- the step ---------------------------------------------------------------------------------
 
@@ -94,6 +100,8 @@ class Overdamped(Implicit):
         return self.tension, self.tension_back
 
     def _solve(self, stages: int, again: bool = False) -> Launch:
+        if self.native and not again:
+            return self._native_solve()
         model, state, p = self.model, self.state, self.model.precision
         hold, given = self.node_hold, self.node_load
         if self.load is not None:
@@ -133,6 +141,35 @@ class Overdamped(Implicit):
         name = "fibers_again" if again else "fibers"
         return Launch(name, kernel, model.fiber_count, inputs, split=True, follows=again)
 
+    def _native_solve(self) -> Launch:
+        model, state, p = self.model, self.state, self.model.precision
+        loaded = self.load is not None
+        inputs = [
+            self.block_start,
+            (2 if self.adaptive else 1) if self.keeps else 0,
+            1 if self.contact is not None and self.contact.packed else 0,
+            self.row_stride,
+            p.vec3(*self.flow_origin),
+            self.step_size,
+            self.fiber_pace,
+            self.stage_gradient,
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            self.rows,
+            state.node_pos,
+            state.node_velocity,
+            self.tension,
+            self.tension_back,
+            self.node_back,
+            self.velocity_back,
+            self.fiber_error,
+            self.load.step_load if self.load is not None else self.node_load,
+            state.status,
+        ]
+        kernel = make_native_chain(p.name, loaded)
+        return Launch("fibers", kernel, self.block_start.shape[0] - 1, inputs, split=True)
+
     def _set_pace(self) -> Launch:
         model, state, p = self.model, self.state, self.model.precision
         assert self.load is not None
@@ -154,7 +191,9 @@ class Overdamped(Implicit):
             self.fiber_pace,
         ]
         kernel = make_chain_pace(p.name)
-        return Launch("set_pace", kernel, model.fiber_count, inputs, split=True, follows=True)
+        # workers share blocks of fibers before, fibers here
+        ahead = not self.native
+        return Launch("set_pace", kernel, model.fiber_count, inputs, split=True, follows=ahead)
 
     def _carry(self) -> Launch:
         model, state = self.model, self.state

@@ -276,7 +276,7 @@ class ChainLoad:
             response.tension,
             self.node_foreseen,
         ]
-        return self._launch("take_off", inputs, follows=True)
+        return self._launch("take_off", inputs)
 
     def note(self, dual: ContactDual, again: bool) -> Launch:
         """After a solve: its forces on the nodes."""
