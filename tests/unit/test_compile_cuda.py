@@ -22,7 +22,7 @@ PASSES = Path(__file__).parents[2] / "warpfiber" / "passes"
 CPU_ONLY = {
     *("make_native_bond_sweep make_native_capsule_pairs make_native_node_sweep".split()),
     *("make_native_pair_sweep make_near_pairs make_search_kernels make_sort_kernels".split()),
-    *("make_native_prune make_chain_relaxation make_rod_relaxation".split()),
+    *("make_native_prune make_native_chain make_chain_relaxation make_rod_relaxation".split()),
     *("wait_kernel meet_kernel".split()),
 }
 # What a flag of this name may be, where it is more than whether something is there.
