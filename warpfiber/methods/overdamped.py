@@ -99,6 +99,12 @@ class Overdamped(Implicit):
         """Tensions now and at the start of the step."""
         return self.tension, self.tension_back
 
+    def _kept(self) -> int:
+        """1 if the start of a step is kept, 2 if a fiber that tears is spared by a shorter one."""
+        # forces may tear a packed fiber in one step
+        spared = self.adaptive or self.paced
+        return (2 if spared else 1) if self.keeps else 0
+
     def _solve(self, stages: int, again: bool = False) -> Launch:
         if self.native and not again:
             return self._native_solve()
@@ -108,8 +114,7 @@ class Overdamped(Implicit):
             hold, given = self.load.step_hold, self.load.step_load
         inputs = [
             stages,
-            # a packed fiber that forces tear in one step is spared by a shorter one
-            (2 if self.adaptive or self.paced else 1) if self.keeps else 0,
+            self._kept(),
             1 if again else 0,
             # packed fibers near the load at which they buckle would answer contact without bounds
             1 if self.contact is not None and self.contact.packed else 0,
@@ -146,7 +151,7 @@ class Overdamped(Implicit):
         loaded = self.load is not None
         inputs = [
             self.block_start,
-            (2 if self.adaptive else 1) if self.keeps else 0,
+            self._kept(),
             1 if self.contact is not None and self.contact.packed else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
