@@ -38,8 +38,8 @@ def dragged(
 def forces(sim: Simulation) -> np.ndarray:
     """On the first fiber, sum over all contacts, in run units."""
     contacts = sim.method.contacts  # type: ignore[attr-defined]
-    acts = contacts.acts.numpy() != 0
-    return contacts.force.numpy()[acts].sum(axis=0)
+    acts = contacts.acts.numpy()[: contacts.search.list.pair_count] != 0
+    return contacts.force.numpy()[: len(acts)][acts].sum(axis=0)
 
 
 def pulls(sim: Simulation, steps: int, every: int) -> np.ndarray:

@@ -42,7 +42,7 @@ from tests.reference import unilateral as un
 from tests.reference.bead_chain import Array, shear_gradient
 from tests.reference.overdamped_step import CHI, step_sdirk2
 from tests.row_cell import RowCell
-from warpfiber.methods.contact import KEEP, KEEP_BENT
+from warpfiber.methods.contact import KEEP, KEEP_BENT, NEAR_BENT
 from warpfiber.placement import place_fibers
 from warpfiber.simulation import Simulation
 
@@ -235,7 +235,7 @@ def expected_rows(
 ) -> list[Any]:
     """Rows of pairs of the step from `before`, whose fibers would end at `free`.
 
-    Those that are near where the step is `foreseen` to end.
+    Those that are near where the step is `foreseen` to end, or whose free ends are near already.
     """
     lattices = sim.method.ends_lattice.numpy()  # type: ignore[attr-defined]
 
@@ -255,7 +255,8 @@ def expected_rows(
     found = cell.expected(keep)
     if foreseen is not None:
         sim.state.node_pos.assign(foreseen)
-        places = {(i, j, round(row.s, 9), round(row.t, 9)) for i, j, _, row in cell.expected(keep)}
+        near = cell.expected(keep, NEAR_BENT)
+        places = {(i, j, round(row.s, 9), round(row.t, 9)) for i, j, _, row in near}
         sim.state.node_pos.assign(free)
         found = [
             (i, j, key, row)
