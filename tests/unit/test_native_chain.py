@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.cell import Kind, bent_fiber
+from warpfiber.methods.overdamped import FILLED
 from warpfiber.model import BAD_FIBER, TORN
 from warpfiber.passes.native_chain import MOST_NODES, chain_blocks
 from warpfiber.simulation import Simulation
@@ -105,9 +106,15 @@ def test_blocks() -> None:
     assert chain_blocks("float32", group).tolist() == [0, 16, 17, 18, 26]
 
 
-def test_long_fibers_are_left_to_the_plain_step(start: Start) -> None:
-    for segments in (MOST_NODES - 1, MOST_NODES):
-        kind = Kind(segments, 1.0)
-        fiber = bent_fiber(kind, np.random.default_rng(1))
-        sim = start([kind], [fiber], numerics={"method": "overdamped", "dt": 0.05}, flow=SHEAR)
-        assert sim.method.native == (segments < MOST_NODES)  # type: ignore[attr-defined]
+@pytest.mark.parametrize(
+    ("segments", "count", "native"),
+    [(MOST_NODES - 1, FILLED, True), (MOST_NODES, FILLED, False), (3, FILLED - 1, False)],
+)
+def test_long_and_few_fibers_are_left_to_the_plain_step(
+    start: Start, segments: int, count: int, native: bool
+) -> None:
+    kind, rng = Kind(segments, 1.0), np.random.default_rng(1)
+    fibers = [bent_fiber(kind, rng, 20.0 * rng.random(3)) for _ in range(count)]
+    numerics = {"method": "overdamped", "dt": 0.05}
+    sim = start([kind], fibers, [0] * count, numerics=numerics, flow=SHEAR)
+    assert sim.method.native == native  # type: ignore[attr-defined]

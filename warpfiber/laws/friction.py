@@ -4,8 +4,9 @@ Source: Mindlin without partial slip, k_t = 8 G* sqrt(R* delta); the memory is k
     the contact and turns with the mean spin about the normal. A contact that is pressed deeper
     keeps its force, one that unloads its displacement, so that no energy is created (Thornton,
     Cummins & Cleary 2013). Sliding leaves the memory at the limit. The opposite rule, by which one
-    that unloads is scaled, presses beds of 60 and 100 fibers 2.4 and 3.1 % harder at a volume
-    fraction of 0.415, and leaves 1.2 instead of 1.0 % of the energy of a thrust unaccounted for.
+    that unloads is scaled, pressed one bed of 60 fibers and one of 100 harder by 2.4 and 3.1 % at a
+    volume fraction of 0.415 (their scatter is not known), and left 1.2 instead of 1.0 % of the
+    energy of a thrust unaccounted for.
 Symbols: h elastic displacement of this side against the other, d overlap (k_t goes with its root),
     n normal, v tangential velocity of this side against the other.
 """

@@ -30,6 +30,9 @@ from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.native_chain import MOST_NODES, chain_blocks, make_native_chain
 from warpfiber.scene import Scene
 
+# Fibers per block of lanes from which vectors pay: a block costs 175 ns per node and solve, a fiber
+# alone 75 (`tools/bench.py accuracy`).
+FILLED = 3
 # Arrays that the next step depends on beside the State and those of every implicit method.
 _CARRIED = ("tension", "tension_back", "node_motion")
 
@@ -73,6 +76,7 @@ class Overdamped(Implicit):
         self.native = device.startswith("cpu") and self.stages == 2 and most <= MOST_NODES
         self.native = self.native and self.node_hold.shape[0] == 0
         blocks = chain_blocks(p.name, model.host["fiber_group"])
+        self.native = self.native and model.fiber_count >= FILLED * (len(blocks) - 1)
         self.block_start = wp.array(blocks, dtype=wp.int32, device=device)
 
     # -- the step ---------------------------------------------------------------------------------
@@ -117,7 +121,7 @@ class Overdamped(Implicit):
             self._kept(),
             1 if again else 0,
             # packed fibers near the load at which they buckle would answer contact without bounds
-            1 if self.contact is not None and self.contact.packed else 0,
+            1 if self.paced else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
@@ -152,7 +156,7 @@ class Overdamped(Implicit):
         inputs = [
             self.block_start,
             self._kept(),
-            1 if self.contact is not None and self.contact.packed else 0,
+            1 if self.paced else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
