@@ -71,7 +71,9 @@ class Overdamped(Implicit):
             if model.starts_bent:
                 self.load = ChainLoad(model, state, response, self.node_hold, self.node_load)
             self._make_contact(response, self.load)
-        self.paced = self.contact is not None and self.contact.packed
+        # packed fibers near the load at which they buckle would answer contact without bounds
+        self.clips = self.contact is not None and self.contact.packed
+        self.paced = self.clips
         # vectors know neither held nodes nor fibers that are carried whole
         self.native = device.startswith("cpu") and self.stages == 2 and most <= MOST_NODES
         self.native = self.native and self.node_hold.shape[0] == 0
@@ -120,8 +122,7 @@ class Overdamped(Implicit):
             stages,
             self._kept(),
             1 if again else 0,
-            # packed fibers near the load at which they buckle would answer contact without bounds
-            1 if self.paced else 0,
+            1 if self.clips else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
@@ -156,7 +157,7 @@ class Overdamped(Implicit):
         inputs = [
             self.block_start,
             self._kept(),
-            1 if self.paced else 0,
+            1 if self.clips else 0,
             self.row_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
