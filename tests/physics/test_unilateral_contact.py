@@ -307,7 +307,7 @@ def test_one_step_of_chains(meeting: Meeting, name: str) -> None:
         keep = KEEP_BENT
     sim = meeting("overdamped", 40, flow=AT_ORIGIN, **keys)
     if packed:
-        sim.method.paced = False  # type: ignore[attr-defined]
+        sim.method.paced = sim.method.clips = False  # type: ignore[attr-defined]
         sim.method.contact.packed = False  # type: ignore[attr-defined]
     before, drift, tension, load = one_step(sim, name == "walls")
     assert (load.size > 0) == packed
