@@ -15,7 +15,8 @@ from tests.physics.test_packed_cells import packed_scene
 from warpfiber.methods.contact import SECOND, SLACK, ImplicitContact
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.executor import Executor
-from warpfiber.passes.overlap_choice import FAR, OverlapChoice
+from warpfiber.passes.native_row_slots import LOOK
+from warpfiber.passes.overlap_choice import OverlapChoice
 from warpfiber.simulation import Simulation
 
 TOLERANCE = 1e-2
@@ -52,7 +53,7 @@ def chosen(sim: Simulation, limit: float) -> OverlapChoice:
     contact = contact_of(sim)
     rows = contact.solves[1][0]
     rows.launches()  # room for the pairs of the list
-    rows.pair_clear.fill_(-1.0)
+    rows.pair_slots.fill_(1)
     choice = OverlapChoice(sim.model, sim.state, limit)
     launches = choice.launches(contact.check, contact.solves[0][0], rows)
     executor = Executor([*launches], "cpu")
@@ -75,8 +76,8 @@ def test_pairs_of_marked_fibers_are_chosen(cell: Simulation) -> None:
     i, j, _ = cell.method.list.host_pairs()  # type: ignore[union-attr]
     is_marked = np.isin(fiber, list(marked))
     near = is_marked[i] | is_marked[j]
-    clear = contact_of(cell).solves[1][0].pair_clear.numpy()[: len(i)]
-    assert (clear == np.where(near, 0.0, np.float64(FAR).astype(clear.dtype))).all()
+    slots = contact_of(cell).solves[1][0].pair_slots.numpy()[: len(i)]
+    assert (slots == np.where(near, LOOK, 0)).all()
     segments = is_marked.copy()
     segments[i[near]] = True
     assert (choice.segment_chosen.numpy().astype(bool) == segments).all()

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfiber.laws.lubrication import OUTER
 from warpfiber.model import Model, State
 from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native_row_slots import FIRST, LAST
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
@@ -40,8 +42,8 @@ class ContactRows:
     `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
     where it would end without them unless given. Free ends with a gap below `near_now` at the
     start have rows whatever is foreseen, places inside a fiber below half of it.
-    `chosen` (S) uint8: rows of these segments alone, and of pairs for which `pair_clear`, which is
-    then left to others, is small.
+    `chosen` (S) uint8: rows of these segments alone; which of their pairs to look at is in
+    `pair_slots` by then.
     """
 
     def __init__(
@@ -84,6 +86,10 @@ class ContactRows:
         self.carried_start = self._int(segments + 1)
         self.segment_rows = self._int(segments)
         self.row_count, self.row_need = self._int(1), self._int(1)
+        fiber = model.host["segment_fiber"]
+        joined = np.concatenate([[False], fiber[1:] == fiber[:-1], [False]])
+        ends = FIRST * ~joined[:-1] + LAST * ~joined[1:]
+        self.segment_ends = wp.array(ends, dtype=wp.uint8, device=model.device)
         self._allocate_rows(capacity or max(64, segments))
         self._fit_pairs()
 
@@ -155,6 +161,7 @@ class ContactRows:
         return [
             self._launch("carry_rows", self._carry_inputs()),
             *([] if self.features.chosen else [self._motion(self.state.node_pos, self.pair_clear)]),
+            # chooses the rows anew
             *([self._motion(self.node_foreseen, self.pair_seen)] if self.foresees else []),
             self._launch("count_rows", self._count_inputs()),
             Call("row_scan", scan),
@@ -180,10 +187,24 @@ class ContactRows:
             self.node_back,
             node_pos,
             self.state.status,
+            *self._looks(),
+            model.segment_fiber,
+            self.segment_ends,
             pair_clear,
+            self.pair_slots,
         ]
         kernel = self.kernels["pair_motion"]
         return Launch("pair_motion", kernel, self.motion_dim, inputs, split=True, follows=True)
+
+    def _looks(self) -> list[Any]:
+        """From where on pairs are looked at, and whether radii are all the same."""
+        real, radii = self.model.precision.real, [row["radius"] for row in self.model.group_rows]
+        widest = max(radii)
+        wet = 0.0 if self.features.lubrication == "none" else 2.0 * OUTER * widest
+        looked_at = max((2.0 + max(self.keep, self.near_now)) * widest, wet)
+        settles = min(radii) == widest and self.near_now <= NEVER and wet == 0.0
+        sizes = [widest, self.keep, self.near_now, looked_at, wet]
+        return [*(real(size) for size in sizes), int(settles)]
 
     def _carry_inputs(self) -> list[Any]:
         return [
@@ -230,7 +251,6 @@ class ContactRows:
             self.node_back,
             self.node_foreseen,
             self.state.status,
-            self.pair_clear if self.pair_seen is None else self.pair_seen,
             self.chosen,
             self.pair_slots,
             self.pair_row_count,

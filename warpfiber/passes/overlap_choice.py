@@ -19,12 +19,12 @@ import warp as wp
 from warpfiber.model import HALT, Model, State, precision
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native_row_slots import LOOK
 
 if TYPE_CHECKING:
     from warpfiber.passes.contact_check import ContactCheck
     from warpfiber.passes.contact_rows import ContactRows
 
-FAR = 1e20  # in place of a distance, of pairs that are passed over
 LOST = 1e20  # radii; more is no overlap but a fiber that is nowhere
 
 
@@ -89,7 +89,7 @@ def make_overlap_choice(name: str, module: str = "unique"):
         fiber_marked: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=wp.int32),
         segment_chosen_out: wp.array(dtype=wp.uint8),
-        pair_clear_out: wp.array(dtype=real),
+        pair_slots_out: wp.array(dtype=wp.uint8),
     ):
         """One thread per segment: its pairs, and whether there are any."""
         if status[wp.static(HALT)] != 0:
@@ -101,10 +101,7 @@ def make_overlap_choice(name: str, module: str = "unique"):
             for k in range(out_start[i], out_start[i + 1]):
                 looked_at = mine | fiber_marked[segment_fiber[pair_j[k]]]
                 chosen = chosen | looked_at
-                clear = real(FAR)
-                if looked_at != wp.uint8(0):
-                    clear = real(0.0)
-                pair_clear_out[k] = clear
+                pair_slots_out[k] = wp.uint8(wp.static(LOOK)) * looked_at
         segment_chosen_out[i] = chosen
 
     kernels = [clear_marks, mark_fibers, choose_pairs]
@@ -128,7 +125,7 @@ class OverlapChoice:
         found = [wp.float64(self.limit), check.largest, check.found, first.row_need]
         marks = [check.overlap, check.overlap_partner, model.segment_fiber]
         pairs = [model.segment_fiber, rows.pairs.out_start, rows.pairs.pair_j]
-        chosen = [self.segment_chosen, rows.pair_clear]
+        chosen = [self.segment_chosen, rows.pair_slots]
         fibers, segments = model.fiber_count, model.segment_count
         return [
             self._launch("clear_marks", fibers, [state.status, self.fiber_marked]),
