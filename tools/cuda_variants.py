@@ -45,6 +45,7 @@ from warpfiber.passes.measure import (
 from warpfiber.passes.measure_layers import make_measure_layers
 from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
+from warpfiber.passes.overlap_choice import make_overlap_choice
 from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.prune_kernels import make_plain_prune, make_wide_kernels
@@ -78,6 +79,7 @@ _RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=Tr
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
 _LISTED = ListFeatures(ALL, (0, 2), True, True, True)
 _ROWS = RowFeatures(True, FLOOR, "shifted", True)
+_CHOSEN = RowFeatures(True, FLOOR, "none", True, True)
 
 FULLEST: tuple[Variant, ...] = (
     (make_clock, (True, True)),
@@ -120,8 +122,11 @@ FULLEST: tuple[Variant, ...] = (
     (make_cell_kernels, (_LISTED,)),
     (make_row_kernels, (_LISTED,)),
     (make_row_count, (_ROWS,)),
+    (make_row_count, (_CHOSEN,)),
+    (make_overlap_choice, ()),
     (make_row_fill, (_ROWS,)),
-    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True),)),
+    (make_row_fill, (_CHOSEN,)),
+    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
     (make_wide_kernels, ()),
