@@ -53,7 +53,9 @@ from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
+from warpfiber.passes.row_slip import make_row_slip
 from warpfiber.passes.rows import make_row_kernels
+from warpfiber.passes.rub_response import make_chain_rub, make_rod_rub, make_rub_clear
 from warpfiber.passes.step_control import (
     make_largest_error,
     make_step_begin,
@@ -108,6 +110,13 @@ FULLEST: tuple[Variant, ...] = (
     *[(make_dual_balance, (law, True)) for law in ("hard", "linear", "exponential")],
     (make_dual_lists, ()),
     (make_dual_step, ()),
+    (make_dual_begin, ("hard", True, "unique", True)),
+    (make_dual_step, ("unique", True)),
+    (make_dual_balance, ("hard", False, "unique", True)),
+    (make_row_slip, (True, True)),
+    (make_rub_clear, ()),
+    (make_rod_rub, (True,)),
+    (make_chain_rub, (True,)),
     (make_rod_response, (True,)),
     (make_rod_apply, ()),
     (make_end_kernels, ()),
@@ -133,7 +142,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_plain_prune, (True,)),
     (make_measure_fibers, (MeasureFeatures(True, True, True, ALL),)),
     (make_measure_layers, (True,)),
-    (make_measure_stress, ()),
+    (make_measure_stress, (True,)),
     (make_measure_pairs, (_PAIRS,)),
     (make_measure_terms, ("closest",)),
 )
@@ -154,6 +163,10 @@ PLAINEST: tuple[Variant, ...] = (
     (make_dual_balance, ("hard", False)),
     (make_rod_step, (False,)),
     (make_rod_response, (False,)),
+    (make_measure_stress, (False,)),
+    (make_row_slip, (False, False)),
+    (make_rod_rub, (False,)),
+    (make_chain_rub, (False,)),
     (make_chain_moves, (False,)),
     (make_chain_response, (False,)),
     (make_chain_load, (False,)),

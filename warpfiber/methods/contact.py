@@ -5,7 +5,7 @@ meet, rows at the start of the step, their forces, the motion that these cause, 
 result. With two linearizations, rows of the result push once more against what is left.
 Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
     result overlaps by more than OVERLAP or in which center lines passed each other is halved.
-Limits: first order in dt; frictionless.
+Limits: first order in dt. Friction with `unilateral` alone, and in the first of two linearizations.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.overlap_choice import OverlapChoice
+from warpfiber.passes.row_slip import Friction
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Fault, Scene, SceneError
@@ -64,6 +65,7 @@ class StepArrays:
     step_size: Any  # (1,) float64
     rejected: Any  # (2,) int32: the step under way, and in all
     verdict: Any  # (2,) int32: verdict of the contacts, fiber that it is about
+    stage_gradient: Any  # (2,) mat33 of the flow
 
 
 class MovingResponse(Response, Protocol):
@@ -139,6 +141,10 @@ class ImplicitContact:
             workers=workers,
             most_skin=SKIN_BENT if self.packed else MOST_SKIN,
         )
+        rub = None
+        if self.hard and (scene.contact.friction > 0.0 or scene.contact.wall_friction > 0.0):
+            between, walls = scene.contact.friction, scene.contact.wall_friction
+            rub = Friction(between, walls, step.stage_gradient, flow_origin, fiber_frozen)
         self.solves: list[tuple[ContactRows, ContactDual]] = []
         linearizations = scene.numerics.linearizations or 1
         self.choice: OverlapChoice | None = None
@@ -160,6 +166,7 @@ class ImplicitContact:
                 near_now=NEAR_BENT if self.packed and not again else NEVER,
                 lubrication="none" if again else scene.contact.lubrication,
                 chosen=self.choice.segment_chosen if again and self.choice else None,
+                friction=None if again else rub,
             )
             dual = ContactDual(
                 model,
@@ -306,6 +313,9 @@ class ImplicitContact:
         for rows, _ in self.solves:
             count = int(rows.row_count.numpy()[0])
             force = np.abs(rows.row_force.numpy()[:count].astype(float))
+            if rows.rub is not None:
+                flat = rows.rub.force.numpy()[:count].astype(float)
+                force = np.hypot(force, np.linalg.norm(flat, axis=1))
             for side in (rows.row_i, rows.row_j):
                 segment = side.numpy()[:count]
                 met = segment >= 0
