@@ -53,6 +53,7 @@ from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
+from warpfiber.passes.row_search import make_row_search
 from warpfiber.passes.row_slip import make_row_slip
 from warpfiber.passes.rows import make_row_kernels
 from warpfiber.passes.rub_response import make_chain_rub, make_rod_rub, make_rub_clear
@@ -79,7 +80,7 @@ _RINGS = replace(_BED, container=True, closed=True)
 _GRIPPED = replace(_BED, press=2, loads=True, grips=True, planes=1)
 _RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
-_LISTED = ListFeatures(ALL, (0, 2), True, True, True)
+_LISTED = ListFeatures(ALL, (0, 2), True, True, True, True)
 _ROWS = RowFeatures(True, FLOOR, "shifted", True)
 _CHOSEN = RowFeatures(True, FLOOR, "none", True, True)
 
@@ -130,6 +131,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_pair_sweep, (_PAIRS,)),
     (make_cell_kernels, (_LISTED,)),
     (make_row_kernels, (_LISTED,)),
+    (make_row_search, (_LISTED,)),
     (make_row_count, (_ROWS,)),
     (make_row_count, (_CHOSEN,)),
     (make_overlap_choice, ()),
@@ -176,6 +178,7 @@ PLAINEST: tuple[Variant, ...] = (
     (make_pair_sweep, (PairFeatures(repulsion=False, lubrication="paper", closed=True),)),
     (make_cell_kernels, (ListFeatures(NONE),)),
     (make_row_kernels, (ListFeatures(NONE),)),
+    (make_row_search, (ListFeatures(NONE),)),
     (make_row_count, (RowFeatures(),)),
     (make_row_count, (RowFeatures(True, lubrication="paper"),)),
     (make_row_fill, (RowFeatures(),)),
