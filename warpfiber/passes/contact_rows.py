@@ -44,6 +44,8 @@ class ContactRows:
     `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
     where it would end without them unless given. Free ends with a gap below `near_now` at the
     start have rows whatever is foreseen, places inside a fiber below half of it.
+    `chosen` (S) uint8: rows of these segments alone; which of their pairs to look at is in
+    `pair_slots` by then.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class ContactRows:
         keep: float = KEEP,
         near_now: float = NEVER,
         lubrication: str = "none",
+        chosen: Any = None,
         friction: Friction | None = None,
         capacity: int | None = None,
     ) -> None:
@@ -71,8 +74,9 @@ class ContactRows:
         self.keep, self.near_now = keep, near_now
         domain = model.domain
         self.features = RowFeatures(
-            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays)
+            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays), chosen is not None
         )
+        self.chosen = wp.zeros(0, dtype=wp.uint8, device=model.device) if chosen is None else chosen
         name, features = model.precision.name, self.features
         module = kernel_module("rows", name, features)
         self.kernels = dict(make_row_count(name, features, module))
@@ -169,7 +173,7 @@ class ContactRows:
         return [
             self._launch("carry_rows", self._carry_inputs()),
             *([rub.carry(self.kernels, self)] if rub is not None else []),
-            self._motion(self.state.node_pos, self.pair_clear),
+            *([] if self.features.chosen else [self._motion(self.state.node_pos, self.pair_clear)]),
             # chooses the rows anew
             *([self._motion(self.node_foreseen, self.pair_seen)] if self.foresees else []),
             self._launch("count_rows", self._count_inputs()),
@@ -261,6 +265,7 @@ class ContactRows:
             self.node_back,
             self.node_foreseen,
             self.state.status,
+            self.chosen,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,
