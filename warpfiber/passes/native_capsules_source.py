@@ -18,6 +18,9 @@ from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_
 LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
+LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
+AHEAD = 4  # blocks of pairs whose nodes are fetched then, else one
+READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
 
@@ -33,6 +36,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
     numbers = {
         "PARTS": PARTS,
         "TIP_BITS": TIP_BITS,
+        "AHEAD": AHEAD,
         "SLOT_HALT": HALT,
     }
     numbers |= image_constants()
@@ -286,8 +290,12 @@ _SWEEP = """
         __builtin_memcpy(&code_j, near_j + first, sizeof(I));
         __builtin_memcpy(&images, near_image + first, sizeof(I));
         const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
-        for (int l = 0; l < W; ++l)
-            __builtin_prefetch((const double*)place + 3L * (near_j[first + W + l] >> TIP_BITS));
+        const int* const later = near_j + first + (is_large ? AHEAD : 1) * W;
+        for (int l = 0; l < W; ++l) {
+            const double* const x = (const double*)place + 3L * (later[l] >> TIP_BITS);
+            __builtin_prefetch(x);
+            if (is_large) __builtin_prefetch(x + 5);
+        }
         V s, t;
         M aligned;
         const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aligned);
@@ -313,6 +321,8 @@ _SWEEP = """
             __builtin_prefetch(load + j, 1);
             __builtin_prefetch(load + j + 1, 1);
             if constexpr (HAS_FRICTION) {
+                __builtin_prefetch(written_last + k);
+                __builtin_prefetch(written_now + k, 1);
                 __builtin_prefetch(kept_last + 4 * k);
                 __builtin_prefetch(kept_now + 4 * k, 1);
             }
@@ -331,7 +341,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
     const int kept_size = pair_step.shape[1], node_count = place.shape[0];
-    const bool one_group = groups.shape[0] == 1;
+    const bool one_group = groups.shape[0] == 1, is_large = node_count > {LARGE};
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
