@@ -62,6 +62,8 @@ class BondedContacts:
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
+        self.bends = wp.zeros(size, dtype=wp.uint8, device=device)  # acts beside a contact
+        self.beside = wp.zeros(size, dtype=p.mat33, device=device)
         kept = size if self.features.friction else 0
         self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
         self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)

@@ -89,6 +89,8 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         contacts.force,
         contacts.moment,
         contacts.arms,
+        contacts.bends,
+        contacts.beside,
         contacts.memory,
         contacts.written,
         state.status,
@@ -103,11 +105,13 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
     gathered: list[Any] = [none_i, none_i, none_i, spheres.pair_acts, none_3, none_3]
-    gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
+    kinds = (p.vec4, wp.uint8, p.mat33)
+    gathered += [wp.zeros(0, dtype=kind, device=model.device) for kind in kinds]
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts
         gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
         gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
+        gathered += [contacts.bends, contacts.beside]
     inputs = [
         p.real(spheres.dt),
         spheres.press.place,

@@ -13,14 +13,13 @@ from functools import cache
 
 import warp as wp
 
-from warpfiber.laws.capsule_contact import ALIGNED
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.contact_memory import make_hand_over
-from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
+from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
 
 
@@ -38,19 +37,18 @@ class CapsuleFeatures:
 def make_capsule_pairs(name: str, features: CapsuleFeatures):
     """Kernel `capsule_pairs`: what every listed pair does now; memories move on by dt."""
     p = precision(name)
-    real, vec2, vec3, vec4, mat33 = p.real, p.vec2, p.vec3, p.vec4, p.mat33
+    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
     normal_contact = make_capsule_touch(name, features.periodic, False, features.closed)
-    _, has_after, _, node_after, _, segment_over = make_ring_nodes(features.closed)
+    _, _, _, node_after, _, segment_over = make_ring_nodes(features.closed)
     neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
     has_dashpot, has_friction = features.dashpot, features.friction
     is_closed = features.closed
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
-    near, aligned = real(END_TOLERANCE[name]), real(ALIGNED)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -74,24 +72,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         v = (one - s) * node_velocity[node] + s * node_velocity[end]
         w = (one - s) * node_spin[node] + s * node_spin[end]
         return v, w
-
-    @wp.func
-    def is_next(
-        gi: BondGroup,
-        gj: BondGroup,
-        at_i: wp.int32,
-        at_j: wp.int32,
-        st: vec2,
-        a: vec3,
-        b: vec3,
-    ) -> wp.bool:
-        """Whether the next segment has the contact, at a glance: most that do not act end here."""
-        ab = wp.dot(a, b)
-        if ab * ab > aligned * wp.length_sq(a) * wp.length_sq(b):
-            return False
-        if st[0] >= one - near and has_after(at_i, gi.segments, ring_of(gi)):
-            return True
-        return st[1] >= one - near and has_after(at_j, gj.segments, ring_of(gj))
 
     @wp.func
     def inverse_mass(g: BondGroup, at: wp.int32, s: real) -> real:
@@ -131,6 +111,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_force_out: wp.array(dtype=vec3),
         pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
+        pair_bends: wp.array(dtype=wp.uint8),
+        pair_beside_out: wp.array(dtype=mat33),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -160,16 +142,23 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             c = delta + st[1] * b - st[0] * a
             push = vec4(zero, zero, zero, zero)
             depth = zero
+            beside = mat33()
             # most listed pairs end here: the constants of their groups are not even read
             if wp.length_sq(c) < largest_reach * largest_reach:
                 fiber_j = segment_fiber[j]
                 other = groups[fiber_group[fiber_j]]
                 reach = gi.radius + other.radius
                 at = node_j - fiber_node_start[fiber_j]
-                if wp.length_sq(c) < reach * reach and not is_next(gi, other, at_i, at, st, a, b):
-                    push, depth, _energy = normal_contact(
+                if wp.length_sq(c) < reach * reach:
+                    push, depth, _energy, beside = normal_contact(
                         gi, other, at_i, at, node_i, node_j, delta, a, b, st, node_pos
                     )
+            bends = wp.uint8(0)
+            if wp.ddot(beside, beside) > zero:
+                bends = wp.uint8(1)
+                pair_beside_out[k] = beside
+            if pair_bends[k] != bends:
+                pair_bends[k] = bends
             if push[0] <= zero:
                 if pair_acts[k] != wp.uint8(0):
                     pair_acts[k] = wp.uint8(0)
@@ -242,7 +231,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
 def make_gather(name: str):
     """`gather_pairs(segment, ...)`: force and moment of its pairs on both nodes of a segment."""
     p = precision(name)
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     zero = real(0.0)
 
     @wp.func
@@ -255,6 +244,8 @@ def make_gather(name: str):
         pair_force: wp.array(dtype=vec3),
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        pair_bends: wp.array(dtype=wp.uint8),
+        pair_beside: wp.array(dtype=mat33),
     ):
         force = vec3(zero, zero, zero)
         moment = vec3(zero, zero, zero)
@@ -268,6 +259,10 @@ def make_gather(name: str):
                 moment += couple
                 second_force += arms[0] * pair_force[k]
                 second_moment += arms[0] * couple
+            if pair_bends[k] != wp.uint8(0):
+                beside = pair_beside[k]
+                force += beside[0] + beside[1]
+                second_force += beside[1]
         for slot in range(in_start[segment], in_start[segment + 1]):
             k = in_pair[slot]
             if pair_acts[k] != wp.uint8(0):
@@ -277,6 +272,10 @@ def make_gather(name: str):
                 moment += couple
                 second_force -= arms[1] * pair_force[k]
                 second_moment += arms[1] * couple
+            if pair_bends[k] != wp.uint8(0):
+                beside = pair_beside[k]
+                force -= beside[0] + beside[1]
+                second_force -= beside[0] + beside[1] + beside[2]
         return force - second_force, moment - second_moment, second_force, second_moment
 
     return gather_pairs

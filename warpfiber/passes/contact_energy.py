@@ -121,12 +121,12 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
                 reach = gi.radius + gj.radius
                 if wp.length_sq(delta + st[1] * b - st[0] * a) >= reach * reach:
                     continue
-                push, _depth, stored = normal_contact(
+                push, _depth, stored, _beside = normal_contact(
                     gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
                 )
+                normal += wp.float64(stored)
                 if push[0] <= zero:
                     continue
-                normal += wp.float64(stored)
                 if wp.static(has_friction):
                     if pair_step[now & 1, k] == now:
                         kept = pair_memory[now & 1, k]
