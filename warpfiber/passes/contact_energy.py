@@ -5,10 +5,8 @@ segment, so they do not depend on the number of workers.
 Source: laws `capsule_contact` and `friction`. A force F does the work F . v dt with v the velocity
     after the second half kick, since nodes have v - a dt / 2 before and v + a dt / 2 after it.
     Friction dissipates what is put in against it less what its memories store.
-Limits: the shares that the minima beside a kink have in one patch (`capsule_touch`) go with how far
-    these are from the node, and no force goes with that: two fibers that bend around each other at
-    their nodes gain 2 % of the energy of an impact, whatever dt. Pushes along partial lines follow
-    from no potential either.
+Limits: pushes along partial lines follow from no potential, nor does the change from lines to
+    points and to the ends of fibers: beds without friction and dashpots gain some percent by it.
 """
 
 from functools import cache
@@ -19,7 +17,7 @@ import warp as wp
 
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes

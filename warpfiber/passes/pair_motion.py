@@ -1,4 +1,8 @@
-"""How near every listed pair surely stays during a step: what rows and checks may pass over.
+"""How near every listed pair surely stays during a step, and which rows of contact it may have.
+
+Rows and checks pass over what stays apart. On the CPU the rows of most others are chosen here too,
+many pairs at a time (`native_row_slots`); a pair that takes more than its own two segments to
+decide is marked LOOK, elsewhere every pair that does not stay apart is.
 
 Source: no two points of two segments approach each other by more than the largest relative motion
     of their ends, so the center lines stay apart by `clear` = distance at the start - that motion.
@@ -14,6 +18,7 @@ import warp as wp
 
 from warpfiber.model import HALT, precision
 from warpfiber.passes.native import lane_types
+from warpfiber.passes.native_row_slots import LOOK, slots_text
 from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE, PairFeatures, make_pair_geometry
 from warpfiber.passes.portions import portioned
 from warpfiber.passes.row_geometry import PARALLEL, make_closest_points, make_row_geometry
@@ -57,18 +62,12 @@ BLOCK = """
     };
     const T* const back = (const T*)node_back.data;
     const T* const now = (const T*)node_pos.data;
-    for (int k = first; k < last; k += W) {
-        // partners are anywhere in memory
-        for (int ahead = k + AHEAD; ahead < k + AHEAD + W && ahead < last; ++ahead) {
-            const long long j = 3ll * segment_node.data[pair_j.data[ahead]];
-            __builtin_prefetch(back + j);
-            __builtin_prefetch(back + j + 5);
-            __builtin_prefetch(now + j);
-            __builtin_prefetch(now + j + 5);
-        }
+    // D, a, b at the start, w, wa, wb, of pairs anywhere in the list
+    struct Motion { V3 d, a, b, w, wa, wb; };
+    auto motion_of = [&](const int* pairs) -> Motion {
         R ra[W], rb[W], rd[W], rw[W], rwa[W], rwb[W];
         for (int l = 0; l < W; ++l) {
-            const int pair = k + l < last ? k + l : last - 1;
+            const int pair = pairs[l];
             const long long i = 3ll * segment_node.data[pair_i.data[pair]];
             const long long j = 3ll * segment_node.data[pair_j.data[pair]];
             const R xi = load(back + i), xj = load(back + j);
@@ -87,19 +86,53 @@ BLOCK = """
                 rw[l] += box(lattice_now, code) - shift;
             }
         }
-        const V3 a = transposed(ra), b = transposed(rb), d = transposed(rd), w = transposed(rw);
-        const V3 wa = transposed(rwa), wb = transposed(rwb);
-        const V least = V(T(1e-30)), aa = larger(a.dot(a), least), bb = larger(b.dot(b), least);
-        const V3 n = a.cross(b);
-        const V area2 = n.dot(n);
-        V s = clipped(d.cross(b).dot(n) / larger(area2, least));
+        return Motion{transposed(rd), transposed(ra), transposed(rb),
+                      transposed(rw), transposed(rwa), transposed(rwb)};
+    };
+    const V least = V(T(1e-30));
+    struct Place { V s, t; };
+    auto closest = [&](const Motion& m, V aa, V bb) -> Place {
+        const V3 n = m.a.cross(m.b);
+        const V area2 = n.dot(n), ab = m.a.dot(m.b);
+        V s = clipped(m.d.cross(m.b).dot(n) / larger(area2, least));
         s = area2 >= T(PARALLEL) * aa * bb ? s : V(T(0.5));
-        const V t = clipped((s * a.dot(b) - d.dot(b)) / bb);
-        s = clipped((t * a.dot(b) + d.dot(a)) / aa);
-        const V3 c = d + b * t - a * s, u = w - wa, v = w + wb, both = v - wa;
-        const V most = larger(larger(w.dot(w), u.dot(u)), larger(v.dot(v), both.dot(both)));
+        const V t = clipped((s * ab - m.d.dot(m.b)) / bb);
+        return Place{clipped((t * ab + m.d.dot(m.a)) / aa), t};
+    };
+SLOTS
+    int waiting[2 * W], held = 0;
+    for (int k = first; k < last; k += W) {
+        // partners are anywhere in memory
+        for (int ahead = k + AHEAD; ahead < k + AHEAD + W && ahead < last; ++ahead) {
+            const long long j = 3ll * segment_node.data[pair_j.data[ahead]];
+            __builtin_prefetch(back + j);
+            __builtin_prefetch(back + j + 5);
+            __builtin_prefetch(now + j);
+            __builtin_prefetch(now + j + 5);
+        }
+        int pairs[W];
+        for (int l = 0; l < W; ++l) pairs[l] = k + l < last ? k + l : last - 1;
+        const Motion m = motion_of(pairs);
+        const V aa = larger(m.a.dot(m.a), least), bb = larger(m.b.dot(m.b), least);
+        const Place at = closest(m, aa, bb);
+        const V3 c = m.d + m.b * at.t - m.a * at.s, u = m.w - m.wa, v = m.w + m.wb, both = v - m.wa;
+        const V most = larger(larger(m.w.dot(m.w), u.dot(u)), larger(v.dot(v), both.dot(both)));
         const V clear = __builtin_elementwise_sqrt(c.dot(c)) - __builtin_elementwise_sqrt(most);
-        for (int l = 0; l < W && k + l < last; ++l) pair_clear.data[k + l] = clear[l];
+        for (int l = 0; l < W && k + l < last; ++l) {
+            pair_clear.data[k + l] = clear[l];
+            pair_slots.data[k + l] = 0;
+            waiting[held] = k + l;
+            held += clear[l] > looked_at ? 0 : 1;
+        }
+        if (held >= W) {
+            find_slots(waiting, W);
+            held -= W;
+            for (int l = 0; l < held; ++l) waiting[l] = waiting[W + l];
+        }
+    }
+    if (held > 0) {
+        for (int l = held; l < W; ++l) waiting[l] = waiting[held - 1];
+        find_slots(waiting, held);
     }
 """
 
@@ -111,7 +144,12 @@ def native_chunks(segment_count: int) -> int:
 
 @cache
 def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: bool = False):
-    """Kernel `pair_motion`, over segments; `native`: over runs of CHUNK_SEGMENTS, for the CPU."""
+    """Kernel `pair_motion`, over segments; `native`: over runs of CHUNK_SEGMENTS, for the CPU.
+
+    `keep`, `near_now` in radii of the thinner fiber; `widest` the largest radius of all; `settles`:
+    all are equal, so that rows can be chosen here; what stays apart by `looked_at` has none, what
+    is nearer than `wet` may have rows of beads.
+    """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     largest_motion, _, _, _ = make_row_geometry(name)
@@ -133,7 +171,16 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        widest: real,
+        keep: real,
+        near_now: real,
+        looked_at: real,
+        wet: real,
+        settles: wp.int32,
+        segment_fiber: wp.array(dtype=wp.int32),
+        segment_ends: wp.array(dtype=wp.uint8),
         pair_clear: wp.array(dtype=real),
+        pair_slots: wp.array(dtype=wp.uint8),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -156,12 +203,14 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             wb = node_pos[node_j + 1] - node_back[node_j + 1] - move_j
             st = closest_points(delta, a, b)
             distance = wp.length(delta + st[1] * b - st[0] * a)
-            pair_clear[k] = distance - largest_motion(w, wa, wb)
+            clear = distance - largest_motion(w, wa, wb)
+            pair_clear[k] = clear
+            pair_slots[k] = wp.uint8(wp.where(clear > looked_at, 0, wp.static(LOOK)))
 
     if not native:
         return pair_motion
 
-    text = BLOCK
+    text = BLOCK.replace("SLOTS", slots_text(name))
     for key, value in {
         "MASK": (1 << IMAGE_BITS) - 1,
         "HALF": 1 << (IMAGE_BITS - 1),
@@ -185,7 +234,16 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         lattice_now: wp.array(dtype=mat33),
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        widest: real,
+        keep: real,
+        near_now: real,
+        looked_at: real,
+        wet: real,
+        settles: wp.int32,
+        segment_fiber: wp.array(dtype=wp.int32),
+        segment_ends: wp.array(dtype=wp.uint8),
         pair_clear: wp.array(dtype=real),
+        pair_slots: wp.array(dtype=wp.uint8),
     ): ...
 
     @wp.kernel(**options)
@@ -202,7 +260,16 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        widest: real,
+        keep: real,
+        near_now: real,
+        looked_at: real,
+        wet: real,
+        settles: wp.int32,
+        segment_fiber: wp.array(dtype=wp.int32),
+        segment_ends: wp.array(dtype=wp.uint8),
         pair_clear: wp.array(dtype=real),
+        pair_slots: wp.array(dtype=wp.uint8),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -219,7 +286,16 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             lattice_now,
             node_back,
             node_pos,
+            widest,
+            keep,
+            near_now,
+            looked_at,
+            wet,
+            settles,
+            segment_fiber,
+            segment_ends,
             pair_clear,
+            pair_slots,
         )
 
     return native_pair_motion

@@ -1,7 +1,8 @@
 """How many rows of contact every segment has, and the forces of the last rows put aside.
 
 One thread owns a segment, its outgoing pairs and its nodes (of a joint the segment that ends
-there). Which slots of a pair have a row is decided here and stored; the fill looks at those alone.
+there). Which slots of a pair have a row is decided here and stored, for what `pair_motion` left
+open; the fill looks at those alone.
 
 Source: rows of `row_geometry`, with the geometry at the start of the step and the motion of the
     step without contact forces; plane walls, one row per node.
@@ -17,6 +18,7 @@ from warpfiber.laws.lubrication import OUTER
 from warpfiber.model import HALT, precision
 from warpfiber.passes.array_rows import PLACES, make_array_rows
 from warpfiber.passes.bead_rows import make_bead_rows
+from warpfiber.passes.native_row_slots import LOOK
 from warpfiber.passes.pairs import NO_IMAGE, PairFeatures, make_pair_geometry
 from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
@@ -36,6 +38,7 @@ class RowFeatures:
     walls: tuple[bool, bool, bool] = (False, False, False)
     lubrication: str = "none"  # none, paper, shifted
     arrays: bool = False  # some walls are arrays of fibers
+    chosen: bool = False  # rows of some segments alone
 
 
 @cache
@@ -104,7 +107,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
-        pair_clear: wp.array(dtype=real),
+        segment_chosen: wp.array(dtype=wp.uint8),
         pair_slots_out: wp.array(dtype=wp.uint8),
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
@@ -113,20 +116,28 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
+        if wp.static(features.chosen):
+            if segment_chosen[i] == wp.uint8(0):
+                segment_rows_out[i] = 0
+                for k in range(out_start[i], out_start[i + 1]):
+                    pair_row_count_out[k] = 0
+                return
         node_i = segment_node[i]
         xi = node_back[node_i]
         a = node_back[node_i + 1] - xi
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
         reach = (real(2.0) + wp.max(keep, near_now)) * widest
-        looked_at = reach
-        if wp.static(has_lubrication):
-            looked_at = wp.max(reach, real(2.0) * outer * widest)
         total = wp.int32(0)
         for k in range(out_start[i], out_start[i + 1]):
-            if pair_clear[k] > looked_at:
-                pair_slots_out[k] = wp.uint8(0)
-                pair_row_count_out[k] = 0
+            known = wp.int32(pair_slots_out[k])
+            if known != wp.static(LOOK):
+                rows = wp.int32(0)
+                if known != 0:
+                    for slot in range(wp.static(SLOTS)):
+                        rows += (known >> slot) & 1
+                pair_row_count_out[k] = rows
+                total += rows
                 continue
             j = pair_j[k]
             node_j = segment_node[j]
