@@ -2,7 +2,8 @@
 
 Between the motion without contact and the end of the step: does the list hold every pair that may
 meet, rows at the start of the step, their forces, the motion that these cause, and a look at the
-result. With two linearizations, rows of the result push once more against what is left.
+result. With two linearizations, rows of the result push once more against what is left; of packed
+fibers those do that the first left overlapping (`passes/overlap_choice`).
 Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
     result overlaps by more than OVERLAP or in which center lines passed each other is halved.
 Limits: first order in dt. Friction with `unilateral` alone, and in the first of two linearizations.
