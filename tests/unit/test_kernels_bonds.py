@@ -183,3 +183,22 @@ def test_rings() -> None:
     bonds = sum(row[f"energy_{part}"] for part in ("stretching", "shear", "bending", "twist"))
     energy = sum(ref.bond_energy(r, m.x, m.q).sum() for r, m in zip(rods, motions, strict=True))
     assert bonds == pytest.approx(energy, rel=1e-8)
+
+
+def test_memory_of_a_wall_ends() -> None:
+    """A fiber that slides along a wall and leaves it keeps no memory, though never a radius away.
+
+    It would begin again with it.
+    """
+    rod = ref.Rod(np.array([[0.4, 0.01, 1.1e-3], [0.4024, 0.01, 1.1e-3]]), 1.2e-3)
+    v = np.tile([0.05, 0.0, 0.02], (2, 1))
+    sim = start_rods([rod], v=v, box=WALLS, contact={"law": "none", "wall_friction": 0.6})
+    depth = sim.method.wall_depth  # type: ignore[attr-defined]
+    sim.step(1)
+    assert depth.numpy().max() > 0.0
+    for _ in range(200):
+        if sim.node_pos[:, 2].min() > 1.2e-3:
+            break
+        sim.step(1)
+    assert 1.2e-3 < sim.node_pos[:, 2].min() < 2.4e-3
+    assert depth.numpy().max() == 0.0
