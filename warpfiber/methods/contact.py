@@ -4,7 +4,8 @@ Between the motion without contact and the end of the step: does the list hold e
 meet, rows at the start of the step, their forces, the motion that these cause, and a look at the
 result. With two linearizations, rows of the result push once more against what is left.
 Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
-    result overlaps by more than OVERLAP or in which center lines passed each other is halved.
+    result overlaps by more than OVERLAP or in which center lines passed each other is taken again,
+    shorter (`passes/contact_verdict`).
 Limits: first order in dt; frictionless.
 """
 
@@ -39,7 +40,7 @@ KEEP_BENT = 1.0
 # half of it). An end that springs from one fiber is stopped by the next, which without contact
 # would have moved apart: so ended most steps of the sliding plate that were halved.
 NEAR_BENT = 2.0
-# Radii: a step that ends with more is repeated by half. Rods hardly ever reach theirs, which costs
+# Radii: a step that ends with more is taken again, shorter. Rods hardly ever reach theirs: it costs
 # some steps in a thousand; flexible fibers would be halved often.
 OVERLAP, OVERLAP_RODS = 0.05, 0.03
 SLACK, SLACK_BENT = 20.0, 50.0  # tolerances of contact: or with more than these
@@ -61,6 +62,7 @@ class StepArrays:
     step_size: Any  # (1,) float64
     rejected: Any  # (2,) int32: the step under way, and in all
     verdict: Any  # (2,) int32: verdict of the contacts, fiber that it is about
+    pace: Any  # (1,) float64 next step over this one
 
 
 class MovingResponse(Response, Protocol):
@@ -205,6 +207,7 @@ class ImplicitContact:
             self.model.segment_fiber,
             state.status,
             step.verdict,
+            step.pace,
         ]
         found += self.check.launches()
         found.append(Launch("verdict", verdict["judge_contacts"], 1, judge))
