@@ -16,7 +16,9 @@ from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bond_energy import make_measure_bonds
 from warpfiber.passes.bond_losses import make_bond_losses
 from warpfiber.passes.bonds import BondFeatures, make_bond_sweep
-from warpfiber.passes.capsule_pairs import CapsuleFeatures, make_capsule_pairs
+from warpfiber.passes.capsule_features import CapsuleFeatures
+from warpfiber.passes.capsule_hits import make_capsule_hits
+from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.cells import ListFeatures, make_cell_kernels
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
 from warpfiber.passes.chain_load import make_chain_load
@@ -94,6 +96,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_bond_drift, ()),
     (make_bond_losses, (_RINGS,)),
     (make_bond_losses, (_GRIPPED,)),
+    (make_capsule_hits, (_RUBBING,)),
     (make_capsule_pairs, (_RUBBING,)),
     (make_contact_energy, (_RUBBING, True)),
     (make_carry_memory, (True,)),
@@ -137,6 +140,7 @@ PLAINEST: tuple[Variant, ...] = (
     (make_carry_fibers, (False, CHI)),
     (make_bond_sweep, (BondFeatures(), False, False)),
     (make_bond_losses, (BondFeatures(),)),
+    (make_capsule_hits, (CapsuleFeatures(),)),
     (make_capsule_pairs, (CapsuleFeatures(),)),
     (make_contact_energy, (CapsuleFeatures(), False)),
     (make_carry_memory, (False,)),

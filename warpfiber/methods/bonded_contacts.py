@@ -14,7 +14,8 @@ import warp as wp
 
 from warpfiber.methods.pair_search import PairSearch
 from warpfiber.model import Model, State
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
+from warpfiber.passes.capsule_hits import part_count
 from warpfiber.passes.contact_memory import NEVER, launch_memories, make_carry_memory
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
@@ -52,6 +53,15 @@ class BondedContacts:
             workers=workers,
             pair_cost=pair_cost,
         )
+        p, device = model.precision, model.device
+        # whether another segment of the same fiber begins where one ends
+        fiber, after = model.host["segment_fiber"], model.host["segment_end"]
+        closing = after != model.host["segment_node"] + 1
+        goes_on = np.append(fiber[1:] == fiber[:-1], False) | closing
+        self.segment_goes_on = wp.array(goes_on.astype(np.uint8), dtype=wp.uint8, device=device)
+        # scratch of the sweep over bonds, zero between steps
+        self.node_force = wp.zeros(model.node_count, dtype=p.vec3, device=device)
+        self.node_moment = wp.zeros(model.node_count, dtype=p.vec3, device=device)
         self._allocate()
 
     def _allocate(self) -> None:
@@ -62,6 +72,11 @@ class BondedContacts:
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
+        self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
+        self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)
+        self.hit_count = wp.zeros(part_count(size, str(device)), dtype=wp.int32, device=device)
+        # pairs that act, packed by fiber: once as outgoing, once as incoming ones, and one ahead
+        self.acting = wp.zeros(2 * size + 1, dtype=wp.int32, device=device)
         kept = size if self.features.friction else 0
         self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
         self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)

@@ -8,6 +8,7 @@ import warp as wp
 
 from warpfiber.passes.bond_drift import make_bond_drift
 from warpfiber.passes.bonds import make_bond_sweep
+from warpfiber.passes.capsule_hits import make_capsule_hits
 from warpfiber.passes.capsule_pairs import make_capsule_pairs
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.executor import Launch
@@ -60,16 +61,34 @@ def drift_launch(spheres: BondedSpheres) -> Launch:
     return Launch("drift", kernel, model.fiber_count, inputs, split=True)
 
 
-def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
-    """What all listed pairs do; memories of friction move on by dt."""
+def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
+    """Which listed pairs may touch, and what they do; memories of friction move on by dt."""
     model, state, p = spheres.model, spheres.state, spheres.model.precision
     contacts, pairs = spheres.contacts, spheres.list
     assert contacts is not None and pairs is not None
+    parts = contacts.hit_count.shape[0]
+    hits = [contacts.hit_pair, contacts.hit_closest, contacts.hit_count]
     inputs = [
+        wp.int32(parts),
+        p.real(REACH_MARGIN * pairs.reach),
+        model.segment_node,
+        model.segment_end,
+        contacts.segment_goes_on,
+        state.lattice_now,
+        pairs.pair_i,
+        pairs.pair_j,
+        pairs.pair_image,
+        spheres.place,
+        state.status,
+        contacts.acts,
+        *hits,
+    ]
+    near = Launch("hits", make_capsule_hits(p.name, contacts.features), parts, inputs, split=True)
+    inputs = [
+        wp.int32(parts),
         p.real(dt),
         p.real(spheres.scene.contact.damping),
         p.real(spheres.scene.contact.friction),
-        p.real(REACH_MARGIN * pairs.reach),
         spheres.groups,
         model.fiber_node_start,
         model.fiber_group,
@@ -77,8 +96,10 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         model.segment_fiber,
         state.lattice_now,
         pairs.out_start,
+        pairs.pair_i,
         pairs.pair_j,
         pairs.pair_image,
+        *hits,
         spheres.place,
         state.node_pos,
         state.node_velocity,
@@ -94,7 +115,8 @@ def pair_launch(spheres: BondedSpheres, dt: float) -> Launch:
         state.status,
     ]
     kernel = make_capsule_pairs(p.name, contacts.features)
-    return Launch("pairs", kernel, model.segment_count, inputs, split=True)
+    # one that begins to act reads the memories of others, which they wrote a step ago
+    return [near, Launch("pairs", kernel, parts, inputs, split=True, follows=True)]
 
 
 def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
@@ -102,12 +124,13 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     model, state, p = spheres.model, spheres.state, spheres.model.precision
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
-    gathered: list[Any] = [none_i, none_i, none_i, spheres.pair_acts, none_3, none_3]
-    gathered.append(wp.zeros(0, dtype=p.vec4, device=model.device))
+    gathered: list[Any] = [*[none_i] * 5, spheres.pair_acts, none_3, none_3]
+    gathered += [wp.zeros(0, dtype=p.vec4, device=model.device), none_i, none_3, none_3]
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts
-        gathered = [pairs.out_start, pairs.in_start, pairs.in_pair]
+        gathered = [pairs.out_start, pairs.in_start, pairs.in_pair, pairs.pair_i, pairs.pair_j]
         gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
+        gathered += [contacts.acting, contacts.node_force, contacts.node_moment]
     inputs = [
         p.real(spheres.dt),
         spheres.press.place,

@@ -26,7 +26,7 @@ from warpfiber.methods.bonded_launches import (
     bond_launch,
     clock_launch,
     drift_launch,
-    pair_launch,
+    pair_launches,
 )
 from warpfiber.methods.energies import Energies
 from warpfiber.methods.method import Method
@@ -169,7 +169,7 @@ class BondedSpheres(Method):
         return [
             *begin,
             drift_launch(self),
-            pair_launch(self, self.dt),
+            *pair_launches(self, self.dt),
             bond_launch(self, drifts=False, kicks=True),
             *end,
         ]
@@ -207,7 +207,7 @@ class BondedSpheres(Method):
             if self.native is not None:
                 first = [self.native.pair_launch(0.0, keeps=True), self._rates()]
             else:
-                first = [pair_launch(self, 0.0), self._rates()]
+                first = [*pair_launches(self, 0.0), self._rates()]
         begin = Executor(first, self.model.device)
         begin.run(1, self._halted)
         begin.close()

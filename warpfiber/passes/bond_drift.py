@@ -10,6 +10,7 @@ import warp as wp
 
 from warpfiber.laws.rotation import make_rotation
 from warpfiber.model import EXPIRED, HALT, precision
+from warpfiber.passes.kernel_module import FUSED
 
 
 @cache
@@ -21,7 +22,7 @@ def make_bond_drift(name: str):
     is_single = name == "float32"
     zero, half = real(0.0), real(0.5)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def bond_drift(
         offset: wp.int32,
         dt: real,

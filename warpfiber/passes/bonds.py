@@ -17,6 +17,7 @@ from warpfiber.laws.rotation import make_rotation
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.capsule_pairs import make_gather
+from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.node_walls import make_node_walls
 
 # Of a node: moves; moves as told; also does not turn; the same in the lower and the upper grip.
@@ -66,7 +67,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         features.container,
         features.planes,
     )
-    gather_pairs = make_gather(name)
+    gather_pairs = make_gather(name, features.closed)
     has_walls, is_metered = features.walled, features.press >= 0
     has_dashpots, has_loads = features.dashpots, features.loads
     has_rings, has_pairs = features.closed, features.pairs
@@ -112,7 +113,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         couple = half * wp.cross(d, force)
         return force, couple + twist, couple - twist, wp.length_sq(d)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def bond_sweep(
         offset: wp.int32,
         dt: real,
@@ -134,10 +135,15 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
         pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        pair_acting: wp.array(dtype=wp.int32),
+        contact_force: wp.array(dtype=vec3),
+        contact_moment: wp.array(dtype=vec3),
         wall_memory: wp.array(dtype=vec3),
         wall_depth: wp.array(dtype=real),
         place: wp.array(dtype=wp.vec3d),
@@ -164,6 +170,29 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         fastest2 = zero
         pushed = wp.vec2d()
 
+        if wp.static(has_pairs):
+            first_segment = first - fiber
+            if wp.static(has_rings):
+                first_segment = fiber_segment_start[fiber]
+            gather_pairs(
+                first_segment,
+                first_segment + last - first + g.closed,
+                first,
+                last,
+                out_start,
+                in_start,
+                in_pair,
+                pair_i,
+                pair_j,
+                pair_acts,
+                pair_force,
+                pair_moment,
+                pair_arms,
+                pair_acting,
+                contact_force,
+                contact_moment,
+            )
+
         # A ring's last bond pulls at the first node now and at the last node in the end.
         force = nothing
         moment = nothing
@@ -184,21 +213,6 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 last_moment = moment_i
                 force = -pull
                 moment = moment_j
-                if wp.static(has_pairs):
-                    push, couple, push_after, couple_after = gather_pairs(
-                        fiber_segment_start[fiber] + last - first,
-                        out_start,
-                        in_start,
-                        in_pair,
-                        pair_acts,
-                        pair_force,
-                        pair_moment,
-                        pair_arms,
-                    )
-                    last_force += push
-                    last_moment += couple
-                    force += push_after
-                    moment += couple_after
                 if not (length2 < torn2):  # not finite is torn too
                     torn = 1
 
@@ -222,25 +236,11 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     moment_after += last_moment
                 if not (length2 < torn2):
                     torn = 1
-
-                if wp.static(has_pairs):
-                    segment = i - fiber
-                    if wp.static(has_rings):
-                        segment = fiber_segment_start[fiber] + i - first
-                    push, couple, push_after, couple_after = gather_pairs(
-                        segment,
-                        out_start,
-                        in_start,
-                        in_pair,
-                        pair_acts,
-                        pair_force,
-                        pair_moment,
-                        pair_arms,
-                    )
-                    force += push
-                    moment += couple
-                    force_after += push_after
-                    moment_after += couple_after
+            if wp.static(has_pairs):
+                force += contact_force[i]
+                moment += contact_moment[i]
+                contact_force[i] = nothing
+                contact_moment[i] = nothing
 
             mass = g.mass
             inertia = g.inertia

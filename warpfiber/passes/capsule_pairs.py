@@ -1,6 +1,6 @@
-"""One sweep over listed pairs of segments of bonded spheres: normal force, dashpot, friction.
+"""One sweep over pairs of segments of bonded spheres that may touch: push, dashpot, friction.
 
-One thread owns a segment and its outgoing pairs. It stores what a pair does, the sweep over bonds
+The pairs are those that `capsule_hits` packed. What a pair does is stored, and the sweep over bonds
 gathers it: nothing is added atomically, so the result does not depend on the number of workers. A
 pair that does not act keeps stale values. Friction has a memory per listed pair (`contact_memory`).
 Source: laws `capsule_contact` and `friction`; dashpot of law `hertz`.
@@ -8,30 +8,21 @@ Limits: where another contact of the same two fibers acts on a neighboring segme
     with its memory.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
 
-from warpfiber.laws.capsule_contact import ALIGNED
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
-from warpfiber.model import HALT, precision
+from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.capsule_features import CapsuleFeatures
+from warpfiber.passes.capsule_hits import part_begin
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.contact_memory import make_hand_over
-from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
+from warpfiber.passes.kernel_module import FUSED
+from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
-
-
-@dataclass(frozen=True)
-class CapsuleFeatures:
-    """What the pair sweep of a scene contains."""
-
-    periodic: bool = False
-    dashpot: bool = False
-    friction: bool = False
-    closed: bool = False  # some fibers are rings
 
 
 @cache
@@ -41,16 +32,14 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     real, vec2, vec3, vec4, mat33 = p.real, p.vec2, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
-    closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
+    _, image_shift, _, _ = make_pair_geometry(name, geometry)
     normal_contact = make_capsule_touch(name, features.periodic, False, features.closed)
-    _, has_after, _, node_after, _, segment_over = make_ring_nodes(features.closed)
+    _, _, _, node_after, _, segment_over = make_ring_nodes(features.closed)
     neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
     has_dashpot, has_friction = features.dashpot, features.friction
-    is_closed = features.closed
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
-    near, aligned = real(END_TOLERANCE[name]), real(ALIGNED)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -76,24 +65,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         return v, w
 
     @wp.func
-    def is_next(
-        gi: BondGroup,
-        gj: BondGroup,
-        at_i: wp.int32,
-        at_j: wp.int32,
-        st: vec2,
-        a: vec3,
-        b: vec3,
-    ) -> wp.bool:
-        """Whether the next segment has the contact, at a glance: most that do not act end here."""
-        ab = wp.dot(a, b)
-        if ab * ab > aligned * wp.length_sq(a) * wp.length_sq(b):
-            return False
-        if st[0] >= one - near and has_after(at_i, gi.segments, ring_of(gi)):
-            return True
-        return st[1] >= one - near and has_after(at_j, gj.segments, ring_of(gj))
-
-    @wp.func
     def inverse_mass(g: BondGroup, at: wp.int32, s: real) -> real:
         """Of a push at the part s of a segment: (1 - s)^2 / m_0 + s^2 / m_1."""
         first = g.mass
@@ -105,13 +76,13 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 second = g.end_mass
         return (one - s) * (one - s) / first + s * s / second
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def capsule_pairs(
         offset: wp.int32,
+        parts: wp.int32,
         dt: real,
         beta: real,
         friction: real,
-        largest_reach: real,
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -119,8 +90,12 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         segment_fiber: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
         out_start: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
+        hit_pair: wp.array(dtype=wp.int32),
+        hit_closest: wp.array(dtype=vec2),
+        hit_count: wp.array(dtype=wp.int32),
         place: wp.array(dtype=wp.vec3d),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
@@ -137,45 +112,37 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     ):
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
-        node_i = segment_node[i]
-        fiber_i = segment_fiber[i]
-        gi = groups[fiber_group[fiber_i]]
-        at_i = node_i - fiber_node_start[fiber_i]
-        xi = place[node_i]
-        end_i = node_after(node_i, at_i, ring_of(gi))
-        a = vec3(place[end_i] - xi)
-        for k in range(out_start[i], out_start[i + 1]):
+        part = wp.tid() + offset
+        begin = part_begin(part, parts, status[wp.static(PAIR_COUNT)])
+        for hit in range(begin, begin + hit_count[part]):
+            k = hit_pair[hit]
+            st = hit_closest[hit]
+            i = pair_i[k]
             j = pair_j[k]
+            node_i = segment_node[i]
             node_j = segment_node[j]
+            fiber_i = segment_fiber[i]
+            fiber_j = segment_fiber[j]
+            gi = groups[fiber_group[fiber_i]]
+            gj = groups[fiber_group[fiber_j]]
+            at_i = node_i - fiber_node_start[fiber_i]
+            at_j = node_j - fiber_node_start[fiber_j]
+            end_i = node_after(node_i, at_i, ring_of(gi))
+            end_j = node_after(node_j, at_j, ring_of(gj))
+            xi = place[node_i]
             xj = place[node_j]
-            end_j = node_j + 1
-            if wp.static(is_closed):
-                fiber = segment_fiber[j]
-                ring = ring_of(groups[fiber_group[fiber]])
-                end_j = node_after(node_j, node_j - fiber_node_start[fiber], ring)
+            a = vec3(place[end_i] - xi)
             b = vec3(place[end_j] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
-            st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
-            push = vec4(zero, zero, zero, zero)
-            depth = zero
-            # most listed pairs end here: the constants of their groups are not even read
-            if wp.length_sq(c) < largest_reach * largest_reach:
-                fiber_j = segment_fiber[j]
-                other = groups[fiber_group[fiber_j]]
-                reach = gi.radius + other.radius
-                at = node_j - fiber_node_start[fiber_j]
-                if wp.length_sq(c) < reach * reach and not is_next(gi, other, at_i, at, st, a, b):
-                    push, depth, _energy = normal_contact(
-                        gi, other, at_i, at, node_i, node_j, delta, a, b, st, node_pos
-                    )
-            if push[0] <= zero:
-                if pair_acts[k] != wp.uint8(0):
-                    pair_acts[k] = wp.uint8(0)
+            reach = gi.radius + gj.radius
+            if wp.length_sq(c) >= reach * reach:
                 continue
-            gj = groups[fiber_group[segment_fiber[j]]]
-            at_j = node_j - fiber_node_start[segment_fiber[j]]
+            push, depth, _energy = normal_contact(
+                gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
+            )
+            if push[0] <= zero:
+                continue
             s = push[2]
             t = push[3]
             c = delta + t * b - s * a
@@ -239,44 +206,66 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
 
 
 @cache
-def make_gather(name: str):
-    """`gather_pairs(segment, ...)`: force and moment of its pairs on both nodes of a segment."""
+def make_gather(name: str, closed: bool):
+    """`gather_pairs(fiber's segments and nodes, ...)`: adds what its pairs do to its nodes.
+
+    Pairs that act are packed first, without a branch: a loop per segment that skips the others
+    takes three times as long, most of it for ends of loops that no processor foresees.
+    """
     p = precision(name)
     real, vec3, vec4 = p.real, p.vec3, p.vec4
-    zero = real(0.0)
+    one = real(1.0)
 
     @wp.func
     def gather_pairs(
-        segment: wp.int32,
+        first_segment: wp.int32,
+        end_segment: wp.int32,
+        first: wp.int32,
+        last: wp.int32,
         out_start: wp.array(dtype=wp.int32),
         in_start: wp.array(dtype=wp.int32),
         in_pair: wp.array(dtype=wp.int32),
+        pair_i: wp.array(dtype=wp.int32),
+        pair_j: wp.array(dtype=wp.int32),
         pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        acting: wp.array(dtype=wp.int32),
+        node_force: wp.array(dtype=vec3),
+        node_moment: wp.array(dtype=vec3),
     ):
-        force = vec3(zero, zero, zero)
-        moment = vec3(zero, zero, zero)
-        second_force = vec3(zero, zero, zero)
-        second_moment = vec3(zero, zero, zero)
-        for k in range(out_start[segment], out_start[segment + 1]):
-            if pair_acts[k] != wp.uint8(0):
-                arms = pair_arms[k]
-                couple = arms[2] * pair_moment[k]
-                force += pair_force[k]
-                moment += couple
-                second_force += arms[0] * pair_force[k]
-                second_moment += arms[0] * couple
-        for slot in range(in_start[segment], in_start[segment + 1]):
+        begin = out_start[first_segment] + in_start[first_segment]
+        found = begin
+        for k in range(out_start[first_segment], out_start[end_segment]):
+            acting[found] = k
+            found += wp.int32(pair_acts[k])
+        incoming = found
+        for slot in range(in_start[first_segment], in_start[end_segment]):
             k = in_pair[slot]
-            if pair_acts[k] != wp.uint8(0):
-                arms = pair_arms[k]
-                couple = arms[3] * pair_moment[k]
-                force -= pair_force[k]
-                moment += couple
-                second_force -= arms[1] * pair_force[k]
-                second_moment += arms[1] * couple
-        return force - second_force, moment - second_moment, second_force, second_moment
+            acting[found] = k
+            found += wp.int32(pair_acts[k])
+        for slot in range(begin, found):
+            k = acting[slot]
+            arms = pair_arms[k]
+            force = pair_force[k]
+            segment = pair_i[k]
+            part = arms[0]
+            arm = arms[2]
+            if slot >= incoming:
+                segment = pair_j[k]
+                force = -force
+                part = arms[1]
+                arm = arms[3]
+            moment = arm * pair_moment[k]
+            node = first + segment - first_segment
+            end = node + 1
+            if wp.static(closed):
+                if node == last:
+                    end = first
+            node_force[node] += (one - part) * force
+            node_moment[node] += (one - part) * moment
+            node_force[end] += part * force
+            node_moment[end] += part * moment
 
     return gather_pairs

@@ -19,7 +19,7 @@ import warp as wp
 
 from warpfiber.model import HALT, precision
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes

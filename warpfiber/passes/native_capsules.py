@@ -15,7 +15,7 @@ import warp as wp
 
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native_capsules_source import capsule_sweep_source
 
 # Arguments of the sweep that are arrays.

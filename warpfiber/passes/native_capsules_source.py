@@ -9,7 +9,7 @@ Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list, `at
 
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
 from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_source

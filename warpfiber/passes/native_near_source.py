@@ -1,6 +1,6 @@
 """C++ text that finds near pairs among listed ones (`near_pairs`), sixteen at a time."""
 
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_rows import DISTANCE, row_source
 from warpfiber.passes.native_capsules_source import LANES, capsule_constants

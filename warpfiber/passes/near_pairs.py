@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import precision
-from warpfiber.passes.capsule_pairs import CapsuleFeatures
+from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native_bonds_source import LANES
 from warpfiber.passes.native_capsules_source import PARTS
 from warpfiber.passes.native_near_source import near_list_source
