@@ -53,6 +53,7 @@ class RowArrays:
     pair_row_count: Any
     in_start: Any
     in_pair: Any
+    rub: Any = None
 
 
 def in_order(rows: Sequence[FlatRow]) -> list[FlatRow]:

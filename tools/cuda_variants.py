@@ -45,6 +45,7 @@ from warpfiber.passes.measure import (
 from warpfiber.passes.measure_layers import make_measure_layers
 from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
+from warpfiber.passes.overlap_choice import make_overlap_choice
 from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.prune_kernels import make_plain_prune, make_wide_kernels
@@ -52,7 +53,10 @@ from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step
 from warpfiber.passes.rod_response import make_rod_apply, make_rod_response
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
+from warpfiber.passes.row_search import make_row_search
+from warpfiber.passes.row_slip import make_row_slip
 from warpfiber.passes.rows import make_row_kernels
+from warpfiber.passes.rub_response import make_chain_rub, make_rod_rub, make_rub_clear
 from warpfiber.passes.step_control import (
     make_largest_error,
     make_step_begin,
@@ -76,8 +80,9 @@ _RINGS = replace(_BED, container=True, closed=True)
 _GRIPPED = replace(_BED, press=2, loads=True, grips=True, planes=1)
 _RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
-_LISTED = ListFeatures(ALL, (0, 2), True, True, True)
+_LISTED = ListFeatures(ALL, (0, 2), True, True, True, True)
 _ROWS = RowFeatures(True, FLOOR, "shifted", True)
+_CHOSEN = RowFeatures(True, FLOOR, "none", True, True)
 
 FULLEST: tuple[Variant, ...] = (
     (make_clock, (True, True)),
@@ -106,6 +111,13 @@ FULLEST: tuple[Variant, ...] = (
     *[(make_dual_balance, (law, True)) for law in ("hard", "linear", "exponential")],
     (make_dual_lists, ()),
     (make_dual_step, ()),
+    (make_dual_begin, ("hard", True, "unique", True)),
+    (make_dual_step, ("unique", True)),
+    (make_dual_balance, ("hard", False, "unique", True)),
+    (make_row_slip, (True, True)),
+    (make_rub_clear, ()),
+    (make_rod_rub, (True,)),
+    (make_chain_rub, (True,)),
     (make_rod_response, (True,)),
     (make_rod_apply, ()),
     (make_end_kernels, ()),
@@ -119,16 +131,20 @@ FULLEST: tuple[Variant, ...] = (
     (make_pair_sweep, (_PAIRS,)),
     (make_cell_kernels, (_LISTED,)),
     (make_row_kernels, (_LISTED,)),
+    (make_row_search, (_LISTED,)),
     (make_row_count, (_ROWS,)),
+    (make_row_count, (_CHOSEN,)),
+    (make_overlap_choice, ()),
     (make_row_fill, (_ROWS,)),
-    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True),)),
+    (make_row_fill, (_CHOSEN,)),
+    (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
     (make_wide_kernels, ()),
     (make_plain_prune, (True,)),
     (make_measure_fibers, (MeasureFeatures(True, True, True, ALL),)),
     (make_measure_layers, (True,)),
-    (make_measure_stress, ()),
+    (make_measure_stress, (True,)),
     (make_measure_pairs, (_PAIRS,)),
     (make_measure_terms, ("closest",)),
 )
@@ -149,6 +165,10 @@ PLAINEST: tuple[Variant, ...] = (
     (make_dual_balance, ("hard", False)),
     (make_rod_step, (False,)),
     (make_rod_response, (False,)),
+    (make_measure_stress, (False,)),
+    (make_row_slip, (False, False)),
+    (make_rod_rub, (False,)),
+    (make_chain_rub, (False,)),
     (make_chain_moves, (False,)),
     (make_chain_response, (False,)),
     (make_chain_load, (False,)),
@@ -158,6 +178,7 @@ PLAINEST: tuple[Variant, ...] = (
     (make_pair_sweep, (PairFeatures(repulsion=False, lubrication="paper", closed=True),)),
     (make_cell_kernels, (ListFeatures(NONE),)),
     (make_row_kernels, (ListFeatures(NONE),)),
+    (make_row_search, (ListFeatures(NONE),)),
     (make_row_count, (RowFeatures(),)),
     (make_row_count, (RowFeatures(True, lubrication="paper"),)),
     (make_row_fill, (RowFeatures(),)),

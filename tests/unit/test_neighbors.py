@@ -13,7 +13,9 @@ from tests.cell import Kind, isotropic, straight_fiber
 from tests.pair_list import SHEAR, Start, cell, check_list, random_fibers
 from tests.reference import segments as sg
 from warpfiber.model import BAD_FIBER, TORN
+from warpfiber.passes import row_search
 from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.rows import make_row_kernels
 from warpfiber.simulation import Diverged
 
 PERIODIC = ["periodic"] * 3
@@ -32,6 +34,21 @@ def test_random(start: Start, boundary: list[str] | None) -> None:
     images = {image for _, _, image in listed}
     wraps = [any(image[axis] for image in images) for axis in range(3)]
     assert wraps == [boundary is not None, boundary == PERIODIC, boundary is not None]
+
+
+@pytest.mark.parametrize("room", [2, 4])
+def test_little_room_for_midpoints(
+    start: Start, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    """Plain kernels that settle a few midpoints at a time find the same pairs."""
+    monkeypatch.setattr(row_search, "ROOM", room)
+    for made in (row_search.make_row_search, make_row_kernels):
+        made.cache_clear()
+    try:
+        test_random(start, PERIODIC)
+    finally:
+        for made in (row_search.make_row_search, make_row_kernels):
+            made.cache_clear()
 
 
 def test_order_is_canonical(start: Start) -> None:

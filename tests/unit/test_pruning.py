@@ -13,7 +13,14 @@ import pytest
 from tests.cell import Kind, listed_pairs
 from tests.pair_list import SHEAR, Start, brute_force, cell, random_fibers
 from warpfiber.methods import bead_chain, pair_search
-from warpfiber.methods.skin import SkinChoice
+from warpfiber.methods.skin import (
+    PAIR_COST,
+    PLAIN_COSTS,
+    PLAIN_PAIR_COST,
+    SIMD_COSTS,
+    SkinChoice,
+)
+from warpfiber.passes import pruning as passes_pruning
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pruning import Pruning
 from warpfiber.simulation import Simulation
@@ -199,6 +206,40 @@ def test_capacities_grow(start: Start) -> None:
     tight.close()
 
 
+def test_the_wide_list_is_loose(start: Start) -> None:
+    """It holds what is within reach of it, and beyond only what float32 cannot tell."""
+    sim = crowd(start)
+    pairs = sim.method.list
+    assert pairs is not None
+    sim.method.search.set_skin(0.6, 1.2)
+    sim.method.refresh_list(wrap=False)
+    wide = pairs.reach + pairs.skin + pairs.margin
+    found = pruning(sim)
+    columns = (a.numpy()[: pairs.kept_count] for a in (found.wide_i, found.wide_j))
+    loose = set(zip(*(column.tolist() for column in columns), strict=True))
+    assert {pair[:2] for pair in brute_force(sim, wide)} <= loose
+    assert loose <= {pair[:2] for pair in brute_force(sim, wide + 0.05)}
+
+
+def test_room_for_kept_pairs_grows(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More pairs than the plain kernels would sort: all of them are sorted before any is used."""
+    lists = []
+    for room in (0.0, 3.0):
+        monkeypatch.setattr(passes_pruning, "ROOM", room)
+        monkeypatch.setattr(bead_chain, "NATIVE", False)
+        sim = crowd(start)
+        pairs = sim.method.list
+        assert pairs is not None
+        sim.method.search.set_skin(0.6, 1.2)
+        sim.method.refresh_list(wrap=False)
+        assert pairs.pair_count > 80
+        lists.append([*pairs.host_pairs(), pairs.in_start.numpy().copy()])
+        lists[-1].append(pairs.in_pair.numpy()[: pairs.pair_count].copy())
+        sim.close()
+    for got, want in zip(*lists, strict=True):
+        assert got.tobytes() == want.tobytes()
+
+
 def choice(**keys: Any) -> SkinChoice:
     """Of segments of 5 diameters that use up 0.035 diameters of skin per step."""
     given: dict[str, Any] = {
@@ -225,6 +266,17 @@ def test_skin_and_margin_are_chosen_together() -> None:
     margin = pruned.choose_margin(thin, 0.8)
     assert thin + margin > 1.2 * thick
     assert pruned.cost(thin, 0.8) < 0.9 * single.cost(thick, 0.8)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_costs_of_the_kernels_in_use(
+    start: Start, monkeypatch: pytest.MonkeyPatch, native: bool
+) -> None:
+    """Skins are chosen by what lists and pairs cost with vectors, or without."""
+    monkeypatch.setattr(bead_chain, "NATIVE", native)
+    skin = crowd(start).method.skin
+    assert skin.costs is (SIMD_COSTS if native else PLAIN_COSTS)
+    assert skin.pair_cost == (PAIR_COST if native else PLAIN_PAIR_COST)
 
 
 def test_margin_has_room_in_the_box() -> None:

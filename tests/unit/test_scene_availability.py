@@ -94,7 +94,17 @@ CONTACT_FAULTS: list[tuple[dict[str, object], str, str]] = [
     ({"box.boundary": ["periodic", "wall", "wall"]}, "contact.law", "walls push by contact"),
     ({"contact.law": "linear"}, "contact.stiffness", "missing"),
     ({"contact.law": "linear", "contact.stiffness": 0}, "contact.stiffness", "a number > 0"),
-    ({"contact.friction": 0.3}, "contact.friction", "contacts are frictionless"),
+    (
+        {"contact.law": "exponential", "contact.friction": 0.3, "numerics.contact": "penalty"},
+        "contact.friction",
+        "penalties are frictionless",
+    ),
+    (
+        {"contact.law": "exponential", "contact.wall_friction": 1, "numerics.contact": "penalty"},
+        "contact.wall_friction",
+        'use numerics.contact = "unilateral"',
+    ),
+    ({"contact.friction": -0.1}, "contact.friction", ">= 0"),
     ({"contact.lubrication": "paper"}, "contact.lubrication", "switches off all pairs"),
     ({"numerics.contact_tolerance": 0}, "numerics.contact_tolerance", "a number > 0"),
     ({"numerics.contact_tolerance": -1e-3}, "numerics.contact_tolerance", "a number > 0"),
@@ -129,6 +139,16 @@ def test_overdamped_loads() -> None:
     assert scene.fibers[0].density is None
     free = scene_from_dict(changed(OVERDAMPED | {"fibers.0.inextensible": True}))
     assert free.fibers[0].inextensible
+
+
+@pytest.mark.parametrize("given", [OVERDAMPED, RODS])
+def test_friction_loads(given: dict[str, object]) -> None:
+    """Of contacts that are not penalties; without a law it is told to be of no effect."""
+    rubbing = {"contact.friction": 0.3, "contact.wall_friction": 0.2}
+    scene = scene_from_dict(changed(given | {"contact.law": "exponential"} | rubbing))
+    assert (scene.contact.friction, scene.contact.wall_friction) == (0.3, 0.2)
+    idle = scene_from_dict(changed(given | rubbing))
+    assert any("contact.friction has no effect" in note for note in idle.notes)
 
 
 @pytest.mark.parametrize("method", ["overdamped", "rigid_rod"])

@@ -18,7 +18,7 @@ from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.methods.method import Method
 from warpfiber.methods.pair_search import PairSearch
-from warpfiber.methods.skin import PAIR_COST
+from warpfiber.methods.skin import PAIR_COST, PLAIN_PAIR_COST
 from warpfiber.methods.step_launches import step_launches
 from warpfiber.model import EXPIRED, TORN, Model, State
 from warpfiber.passes.executor import Call, Launch, Repeat
@@ -64,7 +64,7 @@ class BeadChain(Method):
                 stretch=float(self._segment_stretch().max()),
                 workers=self.workers,
                 native=self.native,
-                pair_cost=PAIR_COST,
+                pair_cost=PAIR_COST if self.native else PLAIN_PAIR_COST,
                 prunes=True,
             )
             self.list, self.skin = self.search.list, self.search.skin

@@ -6,7 +6,7 @@ result. With two linearizations, rows of the result push once more against what 
 Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
     result overlaps by more than OVERLAP or in which center lines passed each other is taken again,
     shorter (`passes/contact_verdict`).
-Limits: first order in dt; frictionless.
+Limits: first order in dt. Friction with `unilateral` alone, and in the first of two linearizations.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.list_bound import FORESEEN
+from warpfiber.passes.overlap_choice import OverlapChoice
+from warpfiber.passes.row_slip import Friction
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Fault, Scene, SceneError
@@ -43,7 +45,9 @@ NEAR_BENT = 2.0
 # Radii: a step that ends with more is taken again, shorter. Rods hardly ever reach theirs: it costs
 # some steps in a thousand; flexible fibers would be halved often.
 OVERLAP, OVERLAP_RODS = 0.05, 0.03
-SLACK, SLACK_BENT = 20.0, 50.0  # tolerances of contact: or with more than these
+SLACK = 20.0  # tolerances of contact: or with more than these
+# Share of that overlap from which packed fibers are pushed apart once more.
+SECOND = 0.5
 SKIN_BENT = 5.0  # diameters, where a few fibers of many spring farther than the others
 # Parts of the first step that no list lasts, below which a step is not worth taking: with a given
 # skin, and with skins that grow as far as the box allows.
@@ -62,6 +66,7 @@ class StepArrays:
     step_size: Any  # (1,) float64
     rejected: Any  # (2,) int32: the step under way, and in all
     verdict: Any  # (2,) int32: verdict of the contacts, fiber that it is about
+    stage_gradient: Any  # (2,) mat33 of the flow
     pace: Any  # (1,) float64 next step over this one
 
 
@@ -124,8 +129,7 @@ class ImplicitContact:
         least = OVERLAP_RODS if scene.numerics.method == "rigid_rod" else OVERLAP
         radii = [row["radius"] for row in model.group_rows]
         self.packed = model.starts_bent
-        slack = SLACK_BENT if self.packed else SLACK
-        self.overlap = max(least, slack * tolerance) if self.hard else FINITE
+        self.overlap = max(least, SLACK * tolerance) if self.hard else FINITE
         keep = KEEP_BENT if self.packed else KEEP
         reach = 2.0 * max(radii) + keep * min(radii)
         if scene.contact.lubrication != "none":
@@ -139,8 +143,17 @@ class ImplicitContact:
             workers=workers,
             most_skin=SKIN_BENT if self.packed else MOST_SKIN,
         )
+        rub = None
+        if self.hard and (scene.contact.friction > 0.0 or scene.contact.wall_friction > 0.0):
+            between, walls = scene.contact.friction, scene.contact.wall_friction
+            rub = Friction(between, walls, step.stage_gradient, flow_origin, fiber_frozen)
         self.solves: list[tuple[ContactRows, ContactDual]] = []
-        for again in range(scene.numerics.linearizations or 1):
+        linearizations = scene.numerics.linearizations or 1
+        self.choice: OverlapChoice | None = None
+        if self.packed and self.hard and linearizations == 1:
+            self.choice = OverlapChoice(model, state, SECOND * self.overlap)
+            linearizations = 2
+        for again in range(linearizations):
             lattice = step.ends_lattice
             rows = ContactRows(
                 model,
@@ -154,6 +167,8 @@ class ImplicitContact:
                 keep=keep,
                 near_now=NEAR_BENT if self.packed and not again else NEVER,
                 lubrication="none" if again else scene.contact.lubrication,
+                chosen=self.choice.segment_chosen if again and self.choice else None,
+                friction=None if again else rub,
             )
             dual = ContactDual(
                 model,
@@ -179,6 +194,7 @@ class ImplicitContact:
             fiber_frozen=fiber_frozen,
             solves=self.solves,
             tears=self.packed,
+            renews=self.choice is not None,
         )
         self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)
@@ -194,7 +210,11 @@ class ImplicitContact:
         state, step, verdict = self.state, self.step, self.check.kernels
         found = self._listed(state.node_pos if self.load is None else self.load.node_foreseen)
         for again, (rows, dual) in enumerate(self.solves):
-            found += [*rows.launches(), *dual.launches(), self.response.apply(dual, carried=1.0)]
+            making = rows.launches()
+            if again and self.choice is not None:
+                found += self.check.launches()
+                found += self.choice.launches(self.check, self.solves[0][0], rows)
+            found += [*making, *dual.launches(), self.response.apply(dual, carried=1.0)]
             if self.load is not None:
                 found.append(self.load.note(dual, again > 0))
         needs = [rows.row_need for rows, _ in self.solves]
@@ -209,7 +229,7 @@ class ImplicitContact:
             step.verdict,
             step.pace,
         ]
-        found += self.check.launches()
+        found += self.check.launches() if self.choice is None else self.check.launches_again()
         found.append(Launch("verdict", verdict["judge_contacts"], 1, judge))
         if self.load is not None:  # fibers that others bend may end elsewhere than was foreseen
             found += self._listed(state.node_pos)
@@ -296,6 +316,9 @@ class ImplicitContact:
         for rows, _ in self.solves:
             count = int(rows.row_count.numpy()[0])
             force = np.abs(rows.row_force.numpy()[:count].astype(float))
+            if rows.rub is not None:
+                flat = rows.rub.force.numpy()[:count].astype(float)
+                force = np.hypot(force, np.linalg.norm(flat, axis=1))
             for side in (rows.row_i, rows.row_j):
                 segment = side.numpy()[:count]
                 met = segment >= 0

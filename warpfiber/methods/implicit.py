@@ -82,6 +82,7 @@ class Implicit(Method):
                 viscosity=scene.flow.viscosity,
                 shears=scene.flow.kind == "simple_shear",
                 fiber_frozen=self._frozen(),
+                has_friction=scene.contact.friction + scene.contact.wall_friction > 0.0,
             )
         # what the step consists of: one module for all kernels that are not of the fibers alone
         sheared, method = model.domain.sheared, scene.numerics.method
@@ -108,6 +109,7 @@ class Implicit(Method):
                 self.step_size,
                 self.rejected,
                 self.verdict,
+                self.stage_gradient,
                 self.pace,
             ),
             flow_origin=self.flow_origin,

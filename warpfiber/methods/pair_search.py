@@ -14,7 +14,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from warpfiber.methods.box_limits import bearable_strain, lasting_height
-from warpfiber.methods.skin import LARGEST_CHANGE, LEAST_SKIN, MOST_SKIN, START_SKIN, SkinChoice
+from warpfiber.methods.skin import (
+    LARGEST_CHANGE,
+    LEAST_SKIN,
+    MOST_SKIN,
+    PLAIN_COSTS,
+    SIMD_COSTS,
+    START_SKIN,
+    SkinChoice,
+)
 from warpfiber.model import PAIR_COUNT, Model, State
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
@@ -94,6 +102,7 @@ class PairSearch:
             length=float(np.average([row["rest"] for row in rows], weights=segments)),
             pieces_per_segment=pairs.piece_count / self.model.segment_count,
             pair_cost=self.pair_cost,
+            costs=SIMD_COSTS if pairs.native else PLAIN_COSTS,
             fixed=self.scene.numerics.skin is not None,
             pruned=pairs.pruning is not None,
         )

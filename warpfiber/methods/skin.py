@@ -26,17 +26,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# ns, one core, float64, 20,000 segments; only ratios matter.
-BUILD_PIECE, BUILD_NEAR = 110.0, 95.0  # of a piece; of what it finds around it at the first skin
-PAIR_COST = 11.0  # of one more listed pair in an explicit step, gathered too
+
+@dataclass(frozen=True)
+class ListCosts:
+    """ns, one core, float64, 20,000 segments; only ratios matter."""
+
+    piece: float  # of a build, of every piece
+    near: float  # of what a piece finds around it at the first skin
+    wide_piece: float  # the same of a wide list
+    wide_near: float
+    wide_pair: float  # of a pair in it
+    prune_segment: float  # of pruning
+    prune_pair: float
+
+
+# Measured with vectors, and without; those of a GPU are not known.
+SIMD_COSTS = ListCosts(110.0, 95.0, 62.0, 104.0, 15.0, 12.0, 6.5)
+PLAIN_COSTS = ListCosts(340.0, 200.0, 280.0, 160.0, 38.0, 26.0, 19.0)
+PAIR_COST, PLAIN_PAIR_COST = 11.0, 21.0  # of one more listed pair in an explicit step
 START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
 RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
 LASTING = 1.3  # uses of a step that a skin must have room for
-# of a wide list: of a piece, of what it finds around it at the first skin, of a listed pair
-WIDE_PIECE, WIDE_NEAR, WIDE_PAIR = 64.0, 121.0, 35.0
-PRUNE_PAIR, PRUNE_SEGMENT = 6.5, 12.0  # of a pair of the wide list, of a segment beside
 START_TIMES, MOST_PRUNED = 2, 12  # skins used up before cells are searched again
 UNEVEN = 1.1  # what a wide list holds more, since skins are used up unevenly
 MEMORY = 0.5  # weight of the use before in the mean
@@ -58,6 +70,7 @@ class SkinChoice:
     length: float  # mean length of a segment
     pieces_per_segment: float
     pair_cost: float = PAIR_COST
+    costs: ListCosts = SIMD_COSTS
     fixed: bool = False
     pruned: bool = False  # from a wide list, whose margin beyond the skin is chosen too
     margin: float = 0.0
@@ -128,7 +141,8 @@ class SkinChoice:
         if self.pruned:
             return self._pruned_least(skin, per_volume)[0]
         pairs = per_volume * self._listed_volume(skin)
-        build = self.pieces_per_segment * (BUILD_PIECE + BUILD_NEAR * self._near(skin))
+        costs = self.costs
+        build = self.pieces_per_segment * (costs.piece + costs.near * self._near(skin))
         return build / max(1.0, skin / self.use) + self.pair_cost * pairs
 
     def first_margin(self) -> float:
@@ -162,9 +176,10 @@ class SkinChoice:
     def _pruned_cost(self, skin: float, times: int, per_volume: float) -> float:
         wide = skin + self._margin(skin, times)
         lasts, wide_pairs = max(1.0, skin / self.use), per_volume * self._listed_volume(wide)
-        build = self.pieces_per_segment * (WIDE_PIECE + WIDE_NEAR * self._near(wide))
-        pruning = PRUNE_SEGMENT + PRUNE_PAIR * wide_pairs
-        renewing = (pruning + (build + WIDE_PAIR * wide_pairs) / times) / lasts
+        costs = self.costs
+        build = self.pieces_per_segment * (costs.wide_piece + costs.wide_near * self._near(wide))
+        pruning = costs.prune_segment + costs.prune_pair * wide_pairs
+        renewing = (pruning + (build + costs.wide_pair * wide_pairs) / times) / lasts
         return renewing + self.pair_cost * per_volume * self._listed_volume(skin)
 
     def _listed_volume(self, skin: float) -> float:

@@ -32,13 +32,17 @@ NO_WRAP = image_code(0, 0, 0)
 
 @dataclass(frozen=True)
 class ListFeatures:
-    """Which axes wrap, whether shear resets the lattice, whether segments are cut into pieces."""
+    """Which axes wrap, whether shear resets the lattice, whether segments are cut into pieces.
+
+    `loose`: the list is pruned, so what only float32 holds for near may stay.
+    """
 
     periodic: tuple[bool, bool, bool]
     shear_axes: tuple[int, int] | None = None
     sheared: bool = False
     pieces: bool = False
     closed: bool = False  # segments that end at the first node of their fiber
+    loose: bool = False
 
 
 # Cell order is random order in memory: what the pieces after this one need is asked for early.
@@ -70,7 +74,7 @@ def make_cell_kernels(
     i_flow, i_gradient = wp.constant(flow_axis), wp.constant(gradient_axis)
     resets = features.shear_axes is not None
     sheared = features.sheared
-    pieces, closed = features.pieces, features.closed
+    pieces, closed, loose = features.pieces, features.closed, features.loose
     half = wp.float64(0.5)
     stored = wp.float32 if native else wp.vec4f
     options = {"module": module, "enable_backward": False, "grid_stride": False}
@@ -285,8 +289,9 @@ def make_cell_kernels(
             reach = real(sizes[2]) / wp.length(axis) * axis
             start -= reach
             axis += reach + reach
-        start_out[k] = start
-        axis_out[k] = axis
+        if not wp.static(loose):
+            start_out[k] = start
+            axis_out[k] = axis
         segment_out[k] = i
         code = piece_wrap[e]
         wrap_out[k] = code

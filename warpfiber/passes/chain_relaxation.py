@@ -3,7 +3,8 @@
 Source: `native_relaxation`; what a fiber does by a unit force at an end of a row (`native_blocks`),
     a column, computed when the row first has a force, with those of other ends of the fiber that
     are likely to have one. What does not fit `columns` is computed again whenever it is needed.
-Symbols: `column_at` of an end (2 r + side): where its column is, in vectors.
+Symbols: `column_at` of an end (2 r + side), with friction also of its two directions in the plane
+    (4 r + 2 side + c, behind those): where its column is, in vectors.
 """
 
 from functools import cache
@@ -29,7 +30,7 @@ SIZES = """
     auto ready = [&](int f) {
         for (int r = row_first(f); r < row_last(f); ++r)
             column_at.data[2 * r] = column_at.data[2 * r + 1] = -1;
-    };
+RESET_FRICTION    };
     if (stage == ROWS_STAGE) part_used.data[part] = 0;
 """
 
@@ -43,7 +44,7 @@ COLUMNS = """
         int lane_row[W] = {r}, lane_side[W] = {side}, lanes = 1;
         if (left < 1) {
             T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-            fill(f, 1, lane_row, lane_side, own);
+            fill(f, 1, lane_row, lane_side, ownAT_KIND);
             return own;
         }
         each_end(f, [&](int other, int at_side) {
@@ -55,7 +56,7 @@ COLUMNS = """
             lane_side[lanes++] = at_side;
         });
         T* const own = columns.data + of * room + used;
-        fill(f, lanes, lane_row, lane_side, own);
+        fill(f, lanes, lane_row, lane_side, ownAT_KIND);
         for (int l = 0; l < lanes; ++l)
             column_at.data[2 * lane_row[l] + lane_side[l]] =
                 (int)((of * room + used + (long long)l * size) / W);
@@ -94,18 +95,69 @@ COLUMNS = """
     };
 """
 
+NORMALS = """
+    const int along_normal[W] = {0};
+"""
+RESET = """
+        const int from = 2 * (int)d.row_i.shape[0];
+        for (int k = 4 * row_first(f); k < 4 * row_last(f); ++k) column_at.data[from + k] = -1;
+"""
+
+# Columns along the two directions in the plane of a contact, behind those along the normals.
+FRICTION = """
+    const int rub_from = 2 * (int)d.row_i.shape[0];
+    auto rub_column = [&](int f, int r, int side, int c) -> const T* {
+        auto place = [&](int at_row, int at_side, int at_c) -> int& {
+            return column_at.data[rub_from + 4 * at_row + 2 * at_side + at_c];
+        };
+        int& at = place(r, side, c);
+        if (at >= 0) return columns.data + (long long)W * at;
+        const int size = size_of(f), of = d.fiber_part.data[f];
+        const long long used = part_used.data[of], left = (room - used) / size;
+        int lane_row[W] = {r}, lane_side[W] = {side}, lane_kind[W] = {1 + c}, lanes = 1;
+        if (left < 1) {
+            T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
+            fill(f, 1, lane_row, lane_side, own, lane_kind);
+            return own;
+        }
+        each_end(f, [&](int other, int at_side) {
+            for (int k = 0; k < 2; ++k) {
+                if (lanes == W || lanes == left) return;
+                if (other == r && at_side == side && k == c) continue;
+                if (rows[other].force == T(0) || rubs[other].mu == T(0)) return;
+                if (place(other, at_side, k) >= 0) continue;
+                lane_row[lanes] = other;
+                lane_side[lanes] = at_side;
+                lane_kind[lanes++] = 1 + k;
+            }
+        });
+        T* const own = columns.data + of * room + used;
+        fill(f, lanes, lane_row, lane_side, own, lane_kind);
+        for (int l = 0; l < lanes; ++l)
+            place(lane_row[l], lane_side[l], lane_kind[l] - 1) =
+                (int)((of * room + used + (long long)l * size) / W);
+        part_used.data[of] = used + (long long)lanes * size;
+        return own;
+    };
+"""
+
 
 @cache
-def make_chain_relaxation(name: str, law: str, module: str = "unique") -> Any:
+def make_chain_relaxation(
+    name: str, law: str, module: str = "unique", friction: bool = False
+) -> Any:
     """Kernel `chain_relax` (see `native_relaxation` for its stages): forces, shifts, impulses."""
     real = precision(name).real
     Relaxation = relaxation_struct(name)
     Factor = elimination_row(name)
     begin_solve = make_relaxation_begin(name)
     reply_numbers = make_reply_numbers(name)
-    fibers = SIZES + fill_text(LANES[name]) + COLUMNS
+    fibers = SIZES + fill_text(LANES[name], friction) + (NORMALS if friction else "") + COLUMNS
+    fibers = fibers.replace("AT_KIND", ", along_normal" if friction else "")
+    fibers = fibers.replace("RESET_FRICTION", RESET if friction else "")
+    rubs = FRICTION if friction else None
 
-    @wp.func_native(relaxation_text(name, law, fibers, lane_types(name)))
+    @wp.func_native(relaxation_text(name, law, fibers, lane_types(name), rubs))
     def relax_chains(
         stage: wp.int32,
         part: wp.int32,

@@ -20,6 +20,7 @@ from warpfiber.passes.native import LANES
 from warpfiber.passes.native_blocks import MOST_NODES
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
+from warpfiber.passes.rub_response import make_chain_rub, rub_clear, rub_rows
 from warpfiber.passes.unilateral import ContactDual
 
 BLOCK_SHARE = 32
@@ -194,25 +195,24 @@ class ChainResponse:
         self.segment_impulse = self._array(model.segment_count, p.real)
         self.end_start = self._array(model.fiber_count + 1, wp.int32)
         self.block_start = self._array(model.fiber_count, wp.int32)
-        self._allocate(0)
+        self._allocate(0, 0)
         self.column_at = self._array(0, wp.int32)
 
     def _array(self, size: int, dtype: Any) -> Any:
         return wp.zeros(size, dtype=dtype, device=self.model.device)
 
-    def _allocate(self, ends: int) -> None:
+    def _allocate(self, ends: int, block_share: int | None) -> None:
         real = self.model.precision.real
         self.row_end, self.end_row = self._array(ends, wp.int32), self._array(ends, wp.int32)
         self.end_known = self._array(ends, wp.uint8)
         self.end_force, self.end_move = self._array(ends, real), self._array(ends, real)
         self.end_diagonal = self._array(ends, real)
-        share = BLOCK_SHARE if self.block_share is None else self.block_share
-        self.block = self._array(share * ends, real)
+        self.block = self._array((BLOCK_SHARE if block_share is None else block_share) * ends, real)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
         """Ends and blocks of every fiber, for rows of the present capacity."""
         model, rows, status = self.model, dual.rows, dual.state.status
-        self._allocate(2 * rows.row_i.shape[0])
+        self._allocate(2 * rows.row_i.shape[0], 0 if dual.rubs else self.block_share)
         fibers = model.fiber_count
         name = model.precision.name
         kernels = make_end_kernels(name)
@@ -236,6 +236,7 @@ class ChainResponse:
             Launch("end_count", kernels["end_count"], fibers, counted, split=True, follows=True),
             Launch("end_scan", kernels["end_scan"], 1, scanned),
             Launch("end_fill", kernels["end_fill"], fibers, filled, split=True),
+            *([rub_clear(dual)] if dual.rubs else []),
         ]
 
     def _fibers(self, dual: ContactDual) -> list[Any]:
@@ -265,6 +266,8 @@ class ChainResponse:
 
     def repeat(self, dual: ContactDual) -> Launch:
         """Motion of the ends of all rows."""
+        if dual.rubs:
+            return self._rub(dual)
         model = self.model
         inputs = [
             *self._fibers(dual),
@@ -283,8 +286,35 @@ class ChainResponse:
         kernel = make_chain_moves(model.precision.name, dual.has_frozen)
         return Launch("chain_moves", kernel, model.fiber_count, inputs, split=True)
 
+    def _rub(self, dual: ContactDual) -> Launch:
+        model = self.model
+        inputs = [
+            self.row_stride,
+            dual.step_size,
+            self.fiber_pace,
+            model.groups,
+            model.fiber_node_start,
+            model.fiber_group,
+            dual.fiber_frozen,
+            self.rows,
+            dual.node_start,
+            *rub_rows(dual),
+            self.end_start,
+            dual.control,
+            dual.node_push,
+            self.node_reply,
+            self.reply_impulse,
+            self.segment_impulse,
+            dual.node_shift,
+            dual.fiber_turn,
+        ]
+        kernel = make_chain_rub(model.precision.name, dual.has_frozen, dual.module)
+        return Launch("chain_rub", kernel, model.fiber_count, inputs, split=True)
+
     def end(self, dual: ContactDual) -> list[Launch | Call]:
-        """Shift and tensions of the solution."""
+        """Shift and tensions of the solution; with friction the last update leaves them."""
+        if dual.rubs:
+            return []
         model = self.model
         inputs = [*self._fibers(dual), *self._rows(dual), dual.state.status, *self._work(dual)]
         kernel = make_chain_response(model.precision.name, dual.has_frozen, dual.module)
@@ -300,8 +330,10 @@ class ChainResponse:
         most, parts = int(sizes.max()), work.parts
         # as much as there may be: what the rows of a step do not need stays out of memory
         share = most * parts if self.block_share is None else self.block_share
-        self.block = wp.empty(min(ends * share, MOST_NUMBERS), dtype=p.real, device=model.device)
-        self.column_at = self._array(ends, wp.int32)
+        columns = 3 * ends if dual.rubs else ends
+        size = min(columns * share, MOST_NUMBERS)
+        self.block = wp.empty(size, dtype=p.real, device=model.device)
+        self.column_at = self._array(columns, wp.int32)
         inputs = [
             self.row_stride,
             dual.step_size,
@@ -314,7 +346,7 @@ class ChainResponse:
             self._array(most * parts, p.real),
             self.segment_impulse,
         ]
-        kernel = make_chain_relaxation(p.name, dual.law.kind)
+        kernel = make_chain_relaxation(p.name, dual.law.kind, friction=dual.rubs)
         return [*relaxation_launches(kernel, work, inputs)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:

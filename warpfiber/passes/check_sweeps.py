@@ -34,6 +34,7 @@ class CheckFeatures:
     again: bool = False  # twice
     arrays: bool = False  # some walls are arrays of fibers
     tears: bool = False  # a step that tears a segment is as one that ends nowhere
+    renewed: bool = False  # only what the second solve moved is looked at again
 
 
 @cache
@@ -78,6 +79,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         pair_clear: wp.array(dtype=real),
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
+        row_count: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         overlap_out: wp.array(dtype=real),
         overlap_partner_out: wp.array(dtype=wp.int32),
@@ -91,6 +93,14 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
+        if wp.static(features.renewed):
+            if row_count[0] == 0:
+                return
+            stayed = shift_again[i] == zero
+            for k in range(out_start[i], out_start[i + 1]):
+                stayed = stayed and shift_again[pair_j[k]] == zero
+            if stayed:
+                return
         node_i = segment_node[i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi

@@ -6,6 +6,7 @@ Symbols: run units; overlap in radii of the thinner fiber.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,6 +36,7 @@ class ContactCheck:
     the largest overlap; segment and partner of a crossing (-1: none, as a partner a wall).
     `list_short` (1) int32: 1 if the list may miss a pair that is within its reach where the step
     would end; `list_use` (1) vec3: see `list_bound`.
+    `renews`: the second of two solves is looked at by `launches_again`, where it moved anything.
     """
 
     def __init__(
@@ -49,9 +51,10 @@ class ContactCheck:
         fiber_frozen: Any = None,
         solves: Sequence[tuple[ContactRows, ContactDual]] = (),
         tears: bool = False,
+        renews: bool = False,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
-        self.solves = solves
+        self.solves, self.renews = solves, renews
         self.node_back = node_back
         self.lattice_back, self.lattice_now = lattice_back, lattice_now
         domain, name = model.domain, model.precision.name
@@ -62,12 +65,16 @@ class ContactCheck:
             domain.wall,
             frozen=fiber_frozen is not None,
             shifted=len(solves) > 0,
-            again=len(solves) > 1,
+            again=len(solves) > 1 and not renews,
             arrays=bool(domain.arrays),
             tears=tears,
         )
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))
+        if renews:
+            second = dataclasses.replace(features, again=True, renewed=True)
+            renewed = make_check_sweeps(name, second, kernel_module("check", name, second))
+            self.kernels["check_again"] = renewed["check_segments"]
         self.kernels |= make_list_bound(name, module)
         self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
@@ -93,6 +100,13 @@ class ContactCheck:
 
     def launches(self) -> list[Launch | Call]:
         """Overlaps and crossings at the end of the step; anew after the list grew."""
+        return self._sweep("check_segments")
+
+    def launches_again(self) -> list[Launch | Call]:
+        """The same after the second solve, where the first has been looked at."""
+        return self._sweep("check_again")
+
+    def _sweep(self, name: str) -> list[Launch | Call]:
         model, state, pairs = self.model, self.state, self.pairs
         p, domain = model.precision, model.domain
         low = np.asarray(domain.low)
@@ -117,6 +131,7 @@ class ContactCheck:
             state.node_pos,
             self.solves[0][0].pair_clear if self.solves else self.overlap,
             *([dual.segment_shift for _, dual in self.solves] + 2 * [self.overlap])[:2],
+            self.solves[1][0].row_count if self.renews else self.found,
             state.status,
             self.overlap,
             self.overlap_partner,
@@ -127,7 +142,7 @@ class ContactCheck:
         reduced = [self.overlap_at, self.crossed_of, self.crossed_at]
         finish = [self.overlap, self.overlap_partner, self.crossed_partner, *reduced]
         return [
-            self._launch("check_segments", model.segment_count, segments, split=True),
+            self._launch(name, model.segment_count, segments, split=True),
             self._launch(
                 "reduce_check",
                 chunks,

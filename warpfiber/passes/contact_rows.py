@@ -26,6 +26,7 @@ from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import make_row_fill
+from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
 
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 NEVER = -1e20  # radii: no gap is that small
@@ -36,12 +37,15 @@ class ContactRows:
     """Rows of the step under way; `launches` of a step, `grow` where `row_need` asks for it.
 
     Rows (capacity): `row_i`, `row_j`, `row_s`, `row_t`, `row_normal`, `row_base`,
-    `row_compliance`, `row_force`; those of segment i are `row_out_start[i:i+2]`, those of listed
-    pair k the `pair_row_count[k]` from `pair_row[k]` on, `pair_clear` what its center lines surely
-    stay apart without contact; `row_count` (1) in all, `row_need` (1) is 0 unless they do not fit.
+    `row_compliance`, `row_force`, with friction those of `rub`; those of segment i are
+    `row_out_start[i:i+2]`, those of listed pair k the `pair_row_count[k]` from `pair_row[k]` on,
+    `pair_clear` what its center lines surely stay apart without contact; `row_count` (1) in all,
+    `row_need` (1) is 0 unless they do not fit.
     `node_foreseen`: where the step is thought to end, which decides on the rows that are made;
     where it would end without them unless given. Free ends with a gap below `near_now` at the
     start have rows whatever is foreseen, places inside a fiber below half of it.
+    `chosen` (S) uint8: rows of these segments alone; which of their pairs to look at is in
+    `pair_slots` by then.
     """
 
     def __init__(
@@ -58,6 +62,8 @@ class ContactRows:
         keep: float = KEEP,
         near_now: float = NEVER,
         lubrication: str = "none",
+        chosen: Any = None,
+        friction: Friction | None = None,
         capacity: int | None = None,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
@@ -68,8 +74,9 @@ class ContactRows:
         self.keep, self.near_now = keep, near_now
         domain = model.domain
         self.features = RowFeatures(
-            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays)
+            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays), chosen is not None
         )
+        self.chosen = wp.zeros(0, dtype=wp.uint8, device=model.device) if chosen is None else chosen
         name, features = model.precision.name, self.features
         module = kernel_module("rows", name, features)
         self.kernels = dict(make_row_count(name, features, module))
@@ -77,6 +84,12 @@ class ContactRows:
         self.kernels["pair_motion"] = make_pair_motion(name, features.periodic, module, native)
         self.motion_dim = native_chunks(model.segment_count) if native else model.segment_count
         self.kernels["fill_rows"] = make_row_fill(name, features, module)
+        self.rub: RowSlip | None = None
+        if friction is not None:
+            held = friction.fiber_frozen is not None
+            slip = kernel_module("slip", name, features.periodic, held)
+            self.kernels |= make_row_slip(name, features.periodic, held, slip)
+            self.rub = RowSlip(model, friction)
         segments = model.segment_count
         self.row_out_start = self._int(segments + 1)
         self.carried_start = self._int(segments + 1)
@@ -107,6 +120,8 @@ class ContactRows:
         self.row_s, self.row_t, self.row_base = reals(), reals(), reals()
         self.row_compliance, self.row_force, self.carried_force = reals(), reals(), reals()
         self.row_normal = wp.zeros(capacity, dtype=p.vec3, device=device)
+        if self.rub is not None:
+            self.rub.allocate(capacity)
 
     def _fit_pairs(self) -> None:
         """Room for as many pairs as the list may hold."""
@@ -154,15 +169,18 @@ class ContactRows:
             self.row_count,
             self.row_need,
         ]
+        rub = self.rub
         return [
             self._launch("carry_rows", self._carry_inputs()),
-            self._motion(self.state.node_pos, self.pair_clear),
+            *([rub.carry(self.kernels, self)] if rub is not None else []),
+            *([] if self.features.chosen else [self._motion(self.state.node_pos, self.pair_clear)]),
             # chooses the rows anew
             *([self._motion(self.node_foreseen, self.pair_seen)] if self.foresees else []),
             self._launch("count_rows", self._count_inputs()),
             Call("row_scan", scan),
             Launch("limit_rows", self.kernels["limit_rows"], 1, limit),
             self._launch("fill_rows", self._fill_inputs()),
+            *(rub.fill(self.kernels, self) if rub is not None else []),
         ]
 
     def _launch(self, name: str, inputs: list[Any], follows: bool = False) -> Launch:
@@ -247,6 +265,7 @@ class ContactRows:
             self.node_back,
             self.node_foreseen,
             self.state.status,
+            self.chosen,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,
@@ -295,6 +314,7 @@ class ContactRows:
             "row_j": self.row_j.numpy()[:rows].copy(),
             "row_key": self.row_key.numpy()[:rows].copy(),
             "row_force": self.row_force.numpy()[:rows].copy(),
+            **({} if self.rub is None else {"friction": self.rub.force.numpy()[:rows].copy()}),
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -312,6 +332,7 @@ class ContactRows:
             "row_j": self.carried_j.numpy()[:rows].copy(),
             "row_key": self.carried_key.numpy()[:rows].copy(),
             "row_force": self.carried_force.numpy()[:rows].copy(),
+            **({} if self.rub is None else {"friction": self.rub.carried.numpy()[:rows].copy()}),
         }
 
     def _put(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -325,3 +346,5 @@ class ContactRows:
             whole = np.zeros(self.capacity, dtype=array.numpy().dtype)
             whole[: len(values)] = values
             array.assign(whole)
+        if self.rub is not None:
+            self.rub.put(np.asarray(arrays["friction"]))

@@ -9,6 +9,9 @@ Symbols: w = m^2 weight of a row; dx.dx = sum df^2/w, dx.dg = sum df de, dg.dg =
     estimate of the diagonal of J S J^T, S response of the fibers; fault of a row, a length: |e|
     where f > 0 or lubrication (times D/(D + C)), else |min(e, 0)|.
     control: phase and number of updates as all threads read them, then what the next pass reads.
+    Friction: F <- the part of F - alpha w_t S within |F| <= mu f, S slip in the plane of the row,
+    w_t its weight; fault |F - F(alpha = 1)|/w_t. Coulomb's law is no gradient of anything: the
+    steps are those of the same sums over f and F together.
 Limits: rows in `chunks` runs whose sums are added in order, so the result does not depend on the
     number of workers. The forces of the smallest fault are kept.
 """
@@ -18,7 +21,9 @@ from functools import cache
 import warp as wp
 
 from warpfiber.laws.contact_compliance import make_contact_compliance
+from warpfiber.laws.surface_slip import make_coulomb, make_surface_slip
 from warpfiber.model import precision
+from warpfiber.passes.precision import group_struct
 
 FIRST_STEP = 0.3
 START, GO, RESTORE, DONE = range(4)  # phases of the solve
@@ -36,9 +41,10 @@ def rows_begin(count: wp.int32, chunk: wp.int32, chunks: wp.int32) -> wp.int32:
 
 
 @cache
-def make_dual_step(name: str, module: str = "unique"):
+def make_dual_step(name: str, module: str = "unique", has_friction: bool = False):
     """Kernel `dual_step` (rows in chunks): the next forces, or the end of the solve."""
-    real = precision(name).real
+    real, vec3 = precision(name).real, precision(name).vec3
+    coulomb_force = make_coulomb(name)
     zero, first_step = real(0.0), wp.constant(FIRST_STEP)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -57,6 +63,13 @@ def make_dual_step(name: str, module: str = "unique"):
         row_change: wp.array(dtype=real),
         best: wp.array(dtype=wp.float64),
         control: wp.array(dtype=wp.int32),
+        row_normal: wp.array(dtype=vec3),
+        row_friction: wp.array(dtype=vec3),
+        row_mu: wp.array(dtype=real),
+        row_slip_weight: wp.array(dtype=real),
+        row_slip_now: wp.array(dtype=vec3),
+        row_friction_best: wp.array(dtype=vec3),
+        row_friction_change: wp.array(dtype=vec3),
     ):
         phase = control[wp.static(PHASE)]
         if phase == wp.static(DONE):
@@ -114,14 +127,26 @@ def make_dual_step(name: str, module: str = "unique"):
                     new = wp.max(new, zero)
                 row_change[r] = new - force
                 row_force[r] = new
+                if wp.static(has_friction):
+                    flat = row_friction[r]
+                    if keeps:
+                        row_friction_best[r] = flat
+                    tried = flat - (scale * row_slip_weight[r]) * row_slip_now[r]
+                    tried = coulomb_force(tried, row_normal[r], row_mu[r] * new)
+                    row_friction_change[r] = tried - flat
+                    row_friction[r] = tried
             else:
                 row_force[r] = row_best[r]
+                if wp.static(has_friction):
+                    row_friction[r] = row_friction_best[r]
 
     return dual_step
 
 
 @cache
-def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"):
+def make_dual_balance(
+    name: str, law: str, by_ends: bool, module: str = "unique", has_friction: bool = False
+):
     """Kernel `dual_balance` (rows in chunks): e of every row and the sums for the next step.
 
     `by_ends`: how far the two ends of a row moved along it is in `end_move`, not in `node_shift`,
@@ -130,9 +155,32 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
     """
     p = precision(name)
     real, vec3 = p.real, p.vec3
+    Group = group_struct(name)
     opening, _ = make_contact_compliance(name, law)
+    surface_turn, surface_roll, _ = make_surface_slip(name)
+    coulomb_force = make_coulomb(name)
     zero, one = real(0.0), real(1.0)
     broken = real(BROKEN)
+
+    @wp.func
+    def surface_motion(
+        n: vec3,
+        node: wp.int32,
+        fraction: real,
+        sign: real,
+        radius: real,
+        turned: real,
+        node_start: wp.array(dtype=vec3),
+        node_shift: wp.array(dtype=vec3),
+    ) -> vec3:
+        """What the motion of a fiber adds to the slip at a row."""
+        edge = node_start[node + 1] - node_start[node]
+        length = wp.length(edge)
+        axis = edge / length
+        turn = node_shift[node + 1] - node_shift[node]
+        slip = sign * (node_shift[node] + fraction * turn)
+        slip += surface_turn(n, axis, radius / length, turn)
+        return slip + turned * surface_roll(n, axis, radius)
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
     def dual_balance(
@@ -160,6 +208,19 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
         best: wp.array(dtype=wp.float64),
         control: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
+        groups: wp.array(dtype=Group),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        node_start: wp.array(dtype=vec3),
+        fiber_turn: wp.array(dtype=real),
+        row_i: wp.array(dtype=wp.int32),
+        row_j: wp.array(dtype=wp.int32),
+        row_slip: wp.array(dtype=vec3),
+        row_friction: wp.array(dtype=vec3),
+        row_mu: wp.array(dtype=real),
+        row_slip_weight: wp.array(dtype=real),
+        row_slip_now: wp.array(dtype=vec3),
+        row_friction_change: wp.array(dtype=vec3),
     ):
         chunk = wp.tid() + offset
         phase = control[wp.static(NEXT_PHASE)]
@@ -223,6 +284,51 @@ def make_dual_balance(name: str, law: str, by_ends: bool, module: str = "unique"
                 moved += df * df / wp.float64(weight)
                 mixed += df * de
                 turned += wp.float64(weight) * de * de
+            if wp.static(has_friction):
+                mu = row_mu[r]
+                if mu > zero:
+                    n = row_normal[r]
+                    both = row_node[r]
+                    fiber = segment_fiber[row_i[r]]
+                    radius = groups[fiber_group[fiber]].radius
+                    slip = row_slip[r]
+                    slip += surface_motion(
+                        n,
+                        both[0],
+                        row_s[r],
+                        -one,
+                        radius,
+                        fiber_turn[fiber],
+                        node_start,
+                        node_shift,
+                    )
+                    if both[1] >= 0:
+                        fiber = segment_fiber[row_j[r]]
+                        radius = groups[fiber_group[fiber]].radius
+                        slip += surface_motion(
+                            n,
+                            both[1],
+                            row_t[r],
+                            one,
+                            radius,
+                            fiber_turn[fiber],
+                            node_start,
+                            node_shift,
+                        )
+                    slip -= wp.dot(n, slip) * n
+                    grip = row_slip_weight[r]
+                    flat = row_friction[r]
+                    wanted = coulomb_force(flat - grip * slip, n, mu * force)
+                    missed = wp.length(wanted - flat) / grip
+                    if not (missed < broken):
+                        missed = broken
+                    worst = wp.max(worst, missed)
+                    more = wp.vec3d(row_friction_change[r])
+                    slid = wp.vec3d(slip - row_slip_now[r])
+                    moved += wp.dot(more, more) / wp.float64(grip)
+                    mixed += wp.dot(more, slid)
+                    turned += wp.float64(grip) * wp.dot(slid, slid)
+                    row_slip_now[r] = slip
         sums[wp.static(SUMS) * chunk] = moved
         sums[wp.static(SUMS) * chunk + 1] = mixed
         sums[wp.static(SUMS) * chunk + 2] = turned

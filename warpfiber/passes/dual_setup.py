@@ -11,6 +11,7 @@ import warp as wp
 
 from warpfiber.laws.contact_compliance import make_contact_compliance
 from warpfiber.laws.rod_mobility import make_rod_mobility
+from warpfiber.laws.surface_slip import make_coulomb
 from warpfiber.model import HALT, precision
 from warpfiber.passes.dual_rows import (
     BROKEN,
@@ -26,14 +27,45 @@ from warpfiber.passes.precision import group_struct
 
 
 @cache
-def make_dual_begin(name: str, law: str, has_frozen: bool, module: str = "unique"):
-    """Kernel `dual_begin` (rows in chunks): nodes and weight of every row, warm start, control."""
+def make_dual_begin(
+    name: str, law: str, has_frozen: bool, module: str = "unique", has_friction: bool = False
+):
+    """Kernel `dual_begin` (rows in chunks): nodes and weight of every row, warm start, control.
+
+    With friction also its coefficient and the weight of slip, of which the estimate is the most
+    that a force of any direction in the plane does.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     Group = group_struct(name)
     _, point_mobility = make_rod_mobility(name)
     _, softness = make_contact_compliance(name, law)
+    coulomb_force = make_coulomb(name)
     zero, one, two = real(0.0), real(1.0), real(2.0)
+
+    @wp.func
+    def slip_mobility(
+        segment: wp.int32,
+        fraction: real,
+        groups: wp.array(dtype=Group),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        fiber_group: wp.array(dtype=wp.int32),
+        segment_node: wp.array(dtype=wp.int32),
+        segment_fiber: wp.array(dtype=wp.int32),
+        fiber_frozen: wp.array(dtype=wp.uint8),
+    ) -> real:
+        fiber = segment_fiber[segment]
+        if wp.static(has_frozen):
+            if fiber_frozen[fiber] != wp.uint8(0):
+                return zero
+        g = groups[fiber_group[fiber]]
+        segments = real(g.segments)
+        arc = real(segment_node[segment] - fiber_node_start[fiber]) + fraction
+        arm = wp.abs(arc - real(0.5) * segments) * g.rest + g.radius
+        beads = segments * g.spacing + one
+        weight = segments * g.weight + two * g.weight_excess
+        moved = point_mobility(g.drag, g.torque, beads, weight, arm, zero)
+        return moved + g.radius * g.radius / (g.torque * weight)
 
     @wp.func
     def row_mobility(
@@ -94,6 +126,14 @@ def make_dual_begin(name: str, law: str, has_frozen: bool, module: str = "unique
         best: wp.array(dtype=wp.float64),
         control: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
+        friction: real,
+        wall_friction: real,
+        row_friction: wp.array(dtype=vec3),
+        row_mu: wp.array(dtype=real),
+        row_slip_weight: wp.array(dtype=real),
+        row_slip_now: wp.array(dtype=vec3),
+        row_friction_best: wp.array(dtype=vec3),
+        row_friction_change: wp.array(dtype=vec3),
     ):
         chunk = wp.tid() + offset
         count = row_count[0]
@@ -166,6 +206,42 @@ def make_dual_begin(name: str, law: str, has_frozen: bool, module: str = "unique
             row_best[r] = force
             row_balance[r] = zero
             row_change[r] = zero
+            if wp.static(has_friction):
+                mu = friction
+                moved = slip_mobility(
+                    i,
+                    row_s[r],
+                    groups,
+                    fiber_node_start,
+                    fiber_group,
+                    segment_node,
+                    segment_fiber,
+                    fiber_frozen,
+                )
+                if j < 0:
+                    mu = wall_friction
+                else:
+                    moved += slip_mobility(
+                        j,
+                        row_t[r],
+                        groups,
+                        fiber_node_start,
+                        fiber_group,
+                        segment_node,
+                        segment_fiber,
+                        fiber_frozen,
+                    )
+                if row_compliance[r] > zero or moved == zero:
+                    mu = zero
+                flat = coulomb_force(row_friction[r], n, mu * force)
+                row_mu[r] = mu
+                row_slip_weight[r] = one
+                if moved > zero:
+                    row_slip_weight[r] = one / (dt * moved)
+                row_friction[r] = flat
+                row_friction_best[r] = flat
+                row_slip_now[r] = vec3()
+                row_friction_change[r] = vec3()
 
     return dual_begin
 

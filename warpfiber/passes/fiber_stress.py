@@ -37,11 +37,13 @@ class FiberStress:
         viscosity: float,
         shears: bool,
         fiber_frozen: np.ndarray,
+        has_friction: bool = False,
     ) -> None:
         self.model, self.state = model, state
         self.flow_origin, self.viscosity, self.shears = flow_origin, viscosity, shears
         self.fiber_frozen = wp.array(fiber_frozen, dtype=wp.uint8, device=model.device)
-        self.kernels = make_measure_stress(model.precision.name)
+        self.kernels = make_measure_stress(model.precision.name, has_friction)
+        self.no_friction = wp.zeros(0, dtype=model.precision.vec3, device=model.device)
         self.center = wp.zeros(model.fiber_count, dtype=wp.vec3d, device=model.device)
         # step and contact moments found last; of a restored state: the next step makes its rows
         self.kept: tuple[int, np.ndarray] | None = None
@@ -133,6 +135,7 @@ class FiberStress:
             rows.row_t,
             rows.row_normal,
             rows.row_force,
+            self.no_friction if rows.rub is None else rows.rub.force,
             state.lattice,
             wp.vec3d(*(1.0 if wraps else 0.0 for wraps in model.domain.periodic)),
             model.groups,

@@ -169,21 +169,6 @@ def _native_pairs(pairs: NeighborList) -> Launches:
         ),
         _launch(
             pairs,
-            "confirm_pairs",
-            workers * pairs.region,
-            pairs.region,
-            pairs.sizes,
-            state.lattice,
-            pairs.sorted_start,
-            pairs.sorted_axis,
-            pairs.sorted_segment,
-            pairs.sorted_part,
-            pairs.found_count,
-            *found,
-            follows=True,
-        ),
-        _launch(
-            pairs,
             "order_rows",
             workers,
             workers,
@@ -199,6 +184,8 @@ def _native_pairs(pairs: NeighborList) -> Launches:
             *listed,
         ),
     ]
+    if "confirm_pairs" in pairs.kernels:
+        search.insert(1, _confirm(pairs))
     if pairs.pruning is not None:
         return search
     index = _launch(
@@ -214,6 +201,26 @@ def _native_pairs(pairs: NeighborList) -> Launches:
         state.status[PAIR_COUNT : PAIR_COUNT + 1],
     )
     return [*search, index]
+
+
+def _confirm(pairs: NeighborList) -> Launch:
+    return _launch(
+        pairs,
+        "confirm_pairs",
+        pairs.workers * pairs.region,
+        pairs.region,
+        pairs.sizes,
+        pairs.state.lattice,
+        pairs.sorted_start,
+        pairs.sorted_axis,
+        pairs.sorted_segment,
+        pairs.sorted_part,
+        pairs.found_count,
+        pairs.row_i,
+        pairs.row_j,
+        pairs.row_image,
+        follows=True,
+    )
 
 
 # -- everywhere: padded rows and radix sorts ------------------------------------------------------

@@ -1,8 +1,9 @@
 """First moments of the forces on fibers without inertia: of the drag, and of contact.
 
     drag:     sum over beads of (r - x_c) F_h,  F_h = 6 pi eta a (u - v) on a bead
-    contact:  (x_c,j - x_c,i) F of every pair, F = -f n on i: arms of both fibers and the line from
-              one center line to the other; a wall takes part with the point that is touched
+    contact:  (x_c,j - x_c,i) F of every pair, F = -f n - F_t on i: arms of both fibers and the
+              line from one center line to the other; a wall takes part with the point that is
+              touched
 Both are made symmetric: torques of the fluid on beads add to the antisymmetric part alone, which
 balances that of the drag. Beads between nodes move and lie on a line, so their sum is that over the
 nodes with the Galerkin matrix: sum x_i F_i, F = zeta A (u - v).
@@ -10,7 +11,8 @@ Every thread sums a fixed run of fibers or rows, the host adds the few partial s
 
 Source: Batchelor 1970 for the stress of force-free particles, Brady & Bossis 1988 for what forces
     between them add, with the model's own drag of free-draining beads.
-Symbols: r place of a bead, x_c middle of a fiber by beads, f force of a row, n from i to j.
+Symbols: r place of a bead, x_c middle of a fiber by beads, f force of a row, n from i to j, F_t
+    force of friction on j; the couples of either on a fiber add to the antisymmetric part alone.
 Limits: moments are about the middle of a fiber, which matters where a force from outside (gravity,
     a hold) acts on it. A bead's own stresslet, (20/3) pi eta a^3 times the rate of strain, is left
     out: the drag of the model has none.
@@ -29,7 +31,7 @@ WALL = -1  # partner of a row with a plane wall
 
 
 @cache
-def make_measure_stress(name: str):
+def make_measure_stress(name: str, has_friction: bool = False):
     """Kernels `drag_moments` over runs of fibers and `contact_moments` over runs of rows."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
@@ -108,6 +110,7 @@ def make_measure_stress(name: str):
         row_t: wp.array(dtype=real),
         row_normal: wp.array(dtype=vec3),
         row_force: wp.array(dtype=real),
+        row_friction: wp.array(dtype=vec3),
         lattice: wp.array(dtype=wp.mat33d),
         periodic: wp.vec3d,
         groups: wp.array(dtype=Group),
@@ -129,6 +132,9 @@ def make_measure_stress(name: str):
             if row_force[r] == real(0.0):
                 continue
             force = -wp.float64(row_force[r]) * wp.vec3d(row_normal[r])  # on i
+            if wp.static(has_friction):
+                if row_friction.shape[0] > 0:  # only the first of two linearizations has any
+                    force -= wp.vec3d(row_friction[r])
             node = segment_node[row_i[r]]
             fiber = segment_fiber[row_i[r]]
             s = wp.float64(row_s[r])

@@ -9,20 +9,83 @@ Limits: CPU only; fibers of up to MOST_NODES nodes (stack); sums are in another 
     `chain_reply` and multiplications and additions are fused: equal to rounding.
 """
 
+from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.native import transpose
 
 MOST_NODES = 512
 
 
 # `fill(f, lanes, row, side, column)`: columns of the ends `side` of `row`, one behind the other,
-# of size_of(f) numbers each. `turn(v)` transposes W vectors.
-def fill_text(lanes: int) -> str:
+# of size_of(f) numbers each. With friction `kind` behind: 0 along the normal, 1 and 2 along the
+# directions of the plane. `turn(v)` transposes W vectors.
+def fill_text(lanes: int, friction: bool = False) -> str:
     """C++ text of `fill`."""
-    return FILL.replace("TURN", transpose(lanes)).replace("MOST_NODES", str(MOST_NODES))
+    parts = {
+        "KINDS": ", const int* kind" if friction else "",
+        "LANE_PUSH": PULLS if friction else PUSHES,
+        "NODE_PUSH": PULLED if friction else PUSHED,
+        "LANE_SPIN": SPUN if friction else "",
+        "CHI": repr(CHI),
+        "TURN": transpose(lanes),
+        "MOST_NODES": str(MOST_NODES),
+    }
+    text = FILL
+    for key, value in parts.items():
+        text = text.replace(key, value)
+    return text
+
+
+PUSHES = """
+        V3 push = none;
+        for (int l = 0; l < lanes; ++l) {
+            const Row& from = rows[row[l]];
+            const bool own = side[l] == 0;
+            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
+            share[l] = own ? from.s : from.t;
+            push.x[l] = own ? -from.normal[0] : from.normal[0];
+            push.y[l] = own ? -from.normal[1] : from.normal[1];
+            push.z[l] = own ? -from.normal[2] : from.normal[2];
+        }"""
+PUSHED = """
+                const V part = at == V(T(k)) ? T(1) - share
+                    : (at == V(T(k - 1)) ? share : V(T(0)));
+                V3 r = push * (h * part);"""
+
+# Forces on the surface: different ones on both nodes, and a torque about the axis.
+PULLS = """
+        V3 near = none, far = none;
+        V torque = V(T(0));
+        for (int l = 0; l < lanes; ++l) {
+            const Row& from = rows[row[l]];
+            const bool own = side[l] == 0;
+            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
+            const T part = own ? from.s : from.t;
+            Pull pull = {own ? -from.normal : from.normal, Q{T(0), T(0), T(0), T(0)}, T(0)};
+            const Rub& rub = rubs[row[l]];
+            if (kind[l] > 0)
+                pull = pull_of(row[l], side[l], kind[l] == 1 ? rub.first : rub.second);
+            const Q before = (T(1) - part) * pull.whole - pull.couple;
+            const Q behind = part * pull.whole + pull.couple;
+            torque[l] = pull.torque;
+            near.x[l] = before[0];
+            near.y[l] = before[1];
+            near.z[l] = before[2];
+            far.x[l] = behind[0];
+            far.y[l] = behind[1];
+            far.z[l] = behind[2];
+        }"""
+PULLED = """
+                const V first = at == V(T(k)) ? V(h) : V(T(0));
+                const V second = at == V(T(k - 1)) ? V(h) : V(T(0));
+                V3 r = near * first + far * second;"""
+# Angle of the fiber about its axis, in place of the impulse before its first node.
+SPUN = """
+        const T carried = weight * T(segments) + T(2) * weight_excess;
+        b[0] = torque * (h / (T(CHI) * group.torque * carried));"""
 
 
 FILL = """
-    auto fill = [&](int f, int lanes, const int* row, const int* side, T* column)
+    auto fill = [&](int f, int lanes, const int* row, const int* side, T* columnKINDS)
             __attribute__((noinline)) {
         const int node = d.fiber_node_start.data[f];
         const int segments = d.fiber_node_start.data[f + 1] - node - 1;
@@ -47,26 +110,14 @@ FILL = """
         };
         auto same = [](const auto& u) -> V3 { return V3{V(u[0]), V(u[1]), V(u[2])}; };
         const V3 none = same3(T(0), T(0), T(0));
-        V at = V(T(-9)), share = V(T(0));
-        V3 push = none;
-        for (int l = 0; l < lanes; ++l) {
-            const Row& from = rows[row[l]];
-            const bool own = side[l] == 0;
-            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
-            share[l] = own ? from.s : from.t;
-            push.x[l] = own ? -from.normal[0] : from.normal[0];
-            push.y[l] = own ? -from.normal[1] : from.normal[1];
-            push.z[l] = own ? -from.normal[2] : from.normal[2];
-        }
+        V at = V(T(-9)), share = V(T(0));LANE_PUSH
         for (int again = 0; again < 2; ++again) {
             V3 y1 = none, v1 = none, v2 = none, couple = none, z0 = none, z1 = none;
             V yt1 = V(T(0));
             if (again == 1) z1 = z[0];
             for (int k = 0; k <= segments; ++k) {
                 const auto& row = factors.data[base + k];
-                const V part = at == V(T(k)) ? T(1) - share
-                    : (at == V(T(k - 1)) ? share : V(T(0)));
-                V3 r = push * (h * part);
+NODE_PUSH
                 if (again == 1) {
                     const T drag = k == 0 || k == segments ? drag_end : drag_inner;
                     r = r + z1 * V(drag) + z0 * V(drag_off) + couple;
@@ -111,6 +162,7 @@ FILL = """
                 b[k] = whole;
             }
         }
+LANE_SPIN
         const int size = size_of(f);
         for (int k = 0; 4 * k < size; k += W / 4) {
             V r[W];

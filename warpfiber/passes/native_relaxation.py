@@ -24,6 +24,7 @@ Symbols: e balance of a row, a length; z motion of node k by all forces, four nu
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import precision
 from warpfiber.passes.dual_rows import BROKEN, NEXT_UPDATES, UNSOLVED
+from warpfiber.passes.native_friction import RUB_FORCES, RUB_NAMES, rubbing
 from warpfiber.passes.native_row_order import BEGIN_TEXT, NAMES, ROWS_TEXT, named
 
 OVER = 1.2
@@ -71,7 +72,7 @@ ADD_UP = """
         if (is_fixed(f)) continue;
         each_end(f, [&](int r, int side) {
             if (rows[r].force != T(0)) push(f, r, side, rows[r].force);
-        });
+ADD_FRICTION        });
     }
 """
 
@@ -115,7 +116,7 @@ RELAX = """
     // a few rows that are nearly the same take more, and cost nothing
     const long long limit = (long long)d.most * (count > 100 ? count : 100);
     // with more than a part of `low`; whether it had more than that
-    auto relax = [&](int r, T part) -> bool {
+    auto PRESS = [&](int r, T part) -> bool {
         const T e = balance_of(r);
         const T size = is_open(r) ? -e : wp::abs(e);
         if (!(size > part * small)) return false;
@@ -135,7 +136,7 @@ RELAX = """
         ++relaxed;
         return true;
     };
-    int* const queue = d.queue.data + first;
+RELAX_FRICTION    int* const queue = d.queue.data + first;
     int held = 0, head = 0;
     auto visit_later = [&](int f) {
         if (f < 0 || d.fiber_queued.data[f]) return;
@@ -215,7 +216,7 @@ RELAX = """
             T mine = is_open(r) ? (e < T(0) ? -e : T(0)) : wp::abs(e);
             if (state.step > T(0)) mine *= T(1) - state.soft * state.step / T(over);
             if (!(mine < T(broken)) || e != e) mine = T(broken);
-            fault = wp::max(fault, mine);
+FAULT_FRICTION            fault = wp::max(fault, mine);
             if (mine > T(d.tolerance) && mine < T(broken)) look_at(r, T(1));
         }
         // what small changes have added up to on rows that nobody visited again
@@ -233,7 +234,7 @@ LEAVE = """
         const int f = d.fiber_order.data[q];
         for (int k = 0; k < owned(f); ++k)
             d.row_force.data[row_given(f) + k] = rows[row_first(f) + k].force;
-        const T* const mine = motion + d.fiber_at.data[f];
+LEAVE_FRICTION        const T* const mine = motion + d.fiber_at.data[f];
         const int node = d.fiber_node_start.data[f];
         const int nodes = d.fiber_node_start.data[f + 1] - node;
         for (int k = 0; k < nodes; ++k)
@@ -252,16 +253,19 @@ LEAVE = """
                 d.node_push.data[k][c] += (T(1) - share) * push;
                 d.node_push.data[k + 1][c] += share * push;
             }
-        });
+PUSH_FRICTION        });
     }
     return;
 """
 
 
-def relaxation_text(name: str, law: str, fibers: str, types: str = "") -> str:
+def relaxation_text(
+    name: str, law: str, fibers: str, types: str = "", friction: str | None = None
+) -> str:
     """C++ text of a stage of a solve.
 
-    `fibers`: size_of, ready, push, diagonal_of and leave; `types`: of its vectors.
+    `fibers`: size_of, ready, push, diagonal_of and leave; `types`: of its vectors; `friction`:
+    rub_column of these fibers, where rows have friction.
     """
     real = {"float32": "float", "float64": "double"}[precision(name).name]
     numbers = f"""
@@ -279,7 +283,10 @@ def relaxation_text(name: str, law: str, fibers: str, types: str = "") -> str:
     if (stage == {END}) {{ {LEAVE} }}
     {RELAX}
 """
-    text = named(numbers + NAMES + OPENING[law] + fibers + stages)
+    begin, behind = NAMES + OPENING[law], ""
+    if friction is not None:
+        begin, behind = begin + RUB_NAMES, friction + RUB_FORCES
+    text = named(rubbing(numbers + begin + fibers + behind + stages, name, friction is not None))
     for key, value in {
         "REST_STAGE": REST,
         "ROWS_STAGE": ROWS,

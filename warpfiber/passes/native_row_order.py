@@ -148,7 +148,7 @@ ROWS_TEXT = """
             const bool held = row.at_i == still && row.at_j == still;
             state.low = held && !yields && state.soft == T(0) ? T(broken) : T(0);
             state.step = T(-1);
-        }
+READY_FRICTION        }
     }
     return;
 """

@@ -4,7 +4,7 @@ A worker walks along the rows of cells. Around each of its pieces it looks at th
 the piece, widened by the reach, can touch, half of them (every pair is met once): first the
 distance of the midpoints from the piece, a vector of them at a time, then in the vectors where one
 passes the distance of the two pieces. Both tests admit what float32 cannot decide; `confirm_pairs`
-settles it with the law in the precision of the run.
+settles it with the law in the precision of the run, or pruning where the list is pruned.
 
 What waits for the next test is stored whether it passed or not, and kept by counting on: which one
 passes is anybody's guess, and a wrong one costs a processor more than the test. Whole vectors wait,
@@ -13,7 +13,7 @@ not single pieces, whose numbers would have to be picked from seven arrays. Meas
 midpoints in half precision; 155 with a test of the distance of the two lines before; 168 in vectors
 of 8; 350 for whole fibers of 10 segments as one capsule each, before their segments are looked at.
 
-`rows.find_pairs` is the plain version.
+`row_search.find_pairs` is the plain version.
 """
 
 from functools import cache
@@ -22,7 +22,7 @@ import warp as wp
 
 from warpfiber.laws.segment_distance import make_segment_distance
 from warpfiber.model import precision
-from warpfiber.passes.cells import GEOMETRY_PLANES, NO_WRAP, WRAP_Y, WRAP_Z
+from warpfiber.passes.cells import GEOMETRY_PLANES, NO_WRAP, WRAP_Y, WRAP_Z, ListFeatures
 
 # Rounding of float32: coordinates to ROUNDING of their size, and the squared distance of nearly
 # parallel segments to PARALLEL of their squared half lengths. There sin^2 of the angle is known to
@@ -112,9 +112,10 @@ SEARCH = r"""
                 if (code == NO_WRAP && apart < fiber_skip.data[fiber]
                     && segment_fiber.data[j] == fiber) continue;
                 if (count < region_size) {
-                    found_i.data[region + count] = k;
-                    found_j.data[region + count] = m;
-                    found_image.data[region + count] = code;
+                    const bool swap = LOOSE && (i > j || (i == j && code < NO_WRAP));
+                    found_i.data[region + count] = LOOSE ? (i < j ? i : j) : k;
+                    found_j.data[region + count] = LOOSE ? (i < j ? j : i) : m;
+                    found_image.data[region + count] = swap ? 2 * NO_WRAP - code : code;
                 }
                 ++count;
             }
@@ -202,11 +203,12 @@ SEARCH = r"""
 _CODE = f"({NO_WRAP} + (nx) + {WRAP_Y} * (ny) + {WRAP_Z} * (nz))"
 
 
-def _search_text(periodic: tuple[bool, bool, bool]) -> str:
+def _search_text(periodic: tuple[bool, bool, bool], loose: bool) -> str:
     text = SEARCH.replace("CODE(nx, ny, nz)", _CODE).replace("NO_WRAP", str(NO_WRAP))
     text = text.replace("LANES", str(LANES)).replace(
         "MASK", {8: "unsigned char", 16: "unsigned short"}[LANES]
     )
+    text = text.replace("LOOSE", str(loose).lower())
     text = text.replace("ROUNDING", f"{ROUNDING}f").replace("PARALLEL", f"{PARALLEL}f")
     for axis, wraps in zip("XYZ", periodic, strict=True):
         text = text.replace(f"WRAPS_{axis}", str(int(wraps)))
@@ -217,18 +219,19 @@ assert GEOMETRY_PLANES == 7
 
 
 @cache
-def make_search_kernels(
-    name: str, periodic: tuple[bool, bool, bool], pieces: bool, module: str = "unique"
-):
-    """`search_pairs` (over workers) and `confirm_pairs` (over found places) as a dict by name."""
+def make_search_kernels(name: str, features: ListFeatures, module: str = "unique"):
+    """`search_pairs` (over workers) and `confirm_pairs` (over found places) as a dict by name.
+
+    The latter is left out of a loose list.
+    """
     p = precision(name)
     real, vec3 = p.real, p.vec3
     closest_fractions = make_segment_distance(name)
-    mask = WRAP_Y - 1
+    pieces, mask = features.pieces, WRAP_Y - 1
     offset_image = WRAP_Y // 2
     options = {"module": module, "enable_backward": False, "grid_stride": False}
 
-    @wp.func_native(_search_text(periodic))
+    @wp.func_native(_search_text(features.periodic, features.loose))
     def search(
         worker: wp.int32,
         workers: wp.int32,
@@ -364,4 +367,6 @@ def make_search_kernels(
         found_j_out[slot] = j
         found_image_out[slot] = code
 
+    if features.loose:
+        return {"search_pairs": search_pairs}
     return {"search_pairs": search_pairs, "confirm_pairs": confirm_pairs}

@@ -88,12 +88,14 @@ class NeighborList:
         self.longest_rest = longest_rest
         self.stretch_allowed = max(FIRST_STRETCH, START_ROOM * stretch)
         self.row_capacity = row_capacity
-        room = 1.5 if flow_origin is None else 3.0  # pairs per segment; a wide list has more
-        self.pair_capacity = pair_capacity or max(64, int(room * model.segment_count))
         self.workers = workers
         closed = len(model.segment_end) > 0
         self.native = model.device.startswith("cpu") if native is None else native
         self.native = self.native and not closed  # vectors know open fibers alone
+        room = 1.5  # pairs per segment; a wide list has more
+        if flow_origin is not None:
+            room = 3.0 if self.native else 2.4
+        self.pair_capacity = pair_capacity or max(64, int(room * model.segment_count))
         self.build_count = 0
         self.grow_count = 0
         self._executor: Executor | None = None
@@ -102,19 +104,24 @@ class NeighborList:
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
         features = ListFeatures(
-            domain.periodic, domain.shear_axes, domain.sheared, has_pieces, closed
+            domain.periodic,
+            domain.shear_axes,
+            domain.sheared,
+            has_pieces,
+            closed,
+            loose=flow_origin is not None and not has_pieces,
         )
         if self.native:
             module = kernel_module("list", name, features)
             self.kernels = make_cell_kernels(name, features, True, module)
-            self.kernels |= make_search_kernels(name, domain.periodic, has_pieces, module)
+            self.kernels |= make_search_kernels(name, features, module)
             self.kernels |= make_sort_kernels(module)
         else:
             self.kernels = make_cell_kernels(name, features) | make_row_kernels(name, features)
         if flow_origin is not None:
             self.pruning = Pruning(self, flow_origin)
             self.kernels |= self.pruning.kernels
-        self._allocate_cells()
+        self._allocate_cells(features.loose)
         self._allocate_rows()
         self._allocate_pairs()
 
@@ -197,7 +204,7 @@ class NeighborList:
     def _int(self, size: int) -> Any:
         return wp.zeros(size, dtype=wp.int32, device=self.model.device)
 
-    def _allocate_cells(self) -> None:
+    def _allocate_cells(self, loose: bool) -> None:
         p, device = self.model.precision, self.model.device
         segments, count = self.model.segment_count, self.piece_count
         self.stride = count + PLANE_PADDING
@@ -220,8 +227,9 @@ class NeighborList:
         else:
             size, stored = 2 * count, wp.vec4f
         self.geometry = wp.zeros(size, dtype=stored, device=device)
-        self.sorted_start = wp.zeros(count, dtype=p.vec3, device=device)
-        self.sorted_axis = wp.zeros(count, dtype=p.vec3, device=device)
+        exact = 0 if loose else count
+        self.sorted_start = wp.zeros(exact, dtype=p.vec3, device=device)
+        self.sorted_axis = wp.zeros(exact, dtype=p.vec3, device=device)
         self.sorted_segment = self._int(count)
         self.sorted_wrap = self._int(count)
         self.sorted_part = self._int(len(self.piece_part))

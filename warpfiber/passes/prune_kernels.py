@@ -1,7 +1,8 @@
 """Kernels that prune a wide list of pairs to those near each other now (`pruning`).
 
 Vectors test blocks of pairs on the CPU, each worker its share of the blocks; the plain kernels
-number what is kept by a scan. Either way the order stays that of the wide list.
+take the partners of one segment each and number what is kept by a scan. Either way the order stays
+that of the wide list.
 """
 
 from functools import cache
@@ -240,7 +241,7 @@ def make_native_prune(name: str, periodic: bool, module: str = "unique"):
 
 @cache
 def make_plain_prune(name: str, periodic: bool):
-    """`mark_near` (over listed places) and `keep_near` (over all places) as a dict by name."""
+    """`mark_near` (over owners) and `keep_near` (over owners, or places) as a dict by name."""
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     closest_fractions = make_segment_distance(name)
@@ -252,40 +253,49 @@ def make_plain_prune(name: str, periodic: bool):
         list_sizes: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
         lattice: wp.array(dtype=mat33),
-        wide_total: wp.array(dtype=wp.int32),
-        wide_i: wp.array(dtype=wp.int32),
+        wide_start: wp.array(dtype=wp.int32),
         wide_j: wp.array(dtype=wp.int32),
         wide_image: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
         near_out: wp.array(dtype=wp.int32),
+        near_count_out: wp.array(dtype=wp.int32),
     ):
-        k = wp.tid()
-        if k >= wide_total[0]:
-            near_out[k] = 0
-            return
-        node_i = segment_node[wide_i[k]]
-        node_j = segment_node[wide_j[k]]
+        """Places of the near partners, at the begin of the row of their segment.
+
+        Stored whether near or not, and kept by counting on: nobody can guess which one is.
+        """
+        i = wp.tid()
+        node_i = segment_node[i]
         xi = node_pos[node_i]
-        xj = node_pos[node_j]
         a = node_pos[node_i + 1] - xi
-        b = node_pos[node_j + 1] - xj
-        delta = xj - xi
-        if wp.static(periodic):
-            code = wide_image[k]
-            if code != wp.static(NO_IMAGE):
-                delta += lattice[0] * unpack_image(code)
-        st = closest_fractions(delta, a, b)
         reach = list_sizes[0]
-        near_out[k] = wp.where(wp.length_sq(delta + st[1] * b - st[0] * a) <= reach * reach, 1, 0)
+        begin = wide_start[i]
+        place = begin
+        for k in range(begin, wide_start[i + 1]):
+            node_j = segment_node[wide_j[k]]
+            xj = node_pos[node_j]
+            b = node_pos[node_j + 1] - xj
+            delta = xj - xi
+            if wp.static(periodic):
+                code = wide_image[k]
+                if code != wp.static(NO_IMAGE):
+                    delta += lattice[0] * unpack_image(code)
+            st = closest_fractions(delta, a, b)
+            c = delta + st[1] * b - st[0] * a
+            near_out[place] = k
+            place += wp.where(wp.length_sq(c) <= reach * reach, 1, 0)
+        near_count_out[i] = place - begin
 
     @wp.kernel(**options)
     def keep_near(
         bins: wp.int32,
+        room: wp.int32,
         near: wp.array(dtype=wp.int32),
         near_end: wp.array(dtype=wp.int32),
-        wide_i: wp.array(dtype=wp.int32),
+        wide_start: wp.array(dtype=wp.int32),
         wide_j: wp.array(dtype=wp.int32),
         wide_image: wp.array(dtype=wp.int32),
+        start_out: wp.array(dtype=wp.int32),
         pair_i_out: wp.array(dtype=wp.int32),
         pair_j_out: wp.array(dtype=wp.int32),
         pair_image_out: wp.array(dtype=wp.int32),
@@ -294,18 +304,28 @@ def make_plain_prune(name: str, periodic: bool):
         status: wp.array(dtype=wp.int32),
     ):
         """Kept pairs; places beyond the last one sort to the end of the order by partner."""
-        k = wp.tid()
-        total = near_end[near.shape[0] - 1]
-        in_pair_out[k] = k
-        if k == 0:
+        i = wp.tid()
+        total = near_end[bins - 1]
+        if i < room:
+            in_pair_out[i] = i
+            if i >= total:
+                in_key_out[i] = bins
+        if i == 0:
             status[wp.static(PAIR_COUNT)] = total
-        if k >= total:
-            in_key_out[k] = bins
-        if near[k] != 0:
-            place = near_end[k] - 1
-            pair_i_out[place] = wide_i[k]
-            pair_j_out[place] = wide_j[k]
-            pair_image_out[place] = wide_image[k]
-            in_key_out[place] = wide_j[k]
+            start_out[bins] = total
+        if i >= bins:
+            return
+        place = wp.int32(0)
+        if i > 0:
+            place = near_end[i - 1]
+        start_out[i] = place
+        row = wide_start[i] - place
+        for to in range(place, near_end[i]):
+            k = near[row + to]
+            j = wide_j[k]
+            pair_i_out[to] = i
+            pair_j_out[to] = j
+            pair_image_out[to] = wide_image[k]
+            in_key_out[to] = j
 
     return {"mark_near": mark_near, "keep_near": keep_near}

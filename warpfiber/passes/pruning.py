@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from warpfiber.passes.neighbors import NeighborList
 
 
+ROOM, GROWTH = 0.8, 1.3  # kept pairs per segment that plain kernels sort; more of them where short
+
+
 class Pruning:
     """The wide list of a NeighborList, and what keeps the pairs of its public arrays from it.
 
@@ -77,7 +80,10 @@ class Pruning:
             self.near_bits = put(math.ceil(size / BLOCK), wp.uint64)
             self.kept = put(self.pairs.workers)
         else:
-            self.near, self.near_end = put(size), put(size)
+            segments = self.pairs.model.segment_count
+            self.near = put(size)
+            self.near_count, self.near_end = put(segments), put(segments)
+            self.room = min(size, math.ceil(ROOM * segments) + 64)
         self.close()
 
     def close(self) -> None:
@@ -116,11 +122,16 @@ class Pruning:
 
         Then pairs may be missing, and a build is due.
         """
-        if self._executor is None:
-            pairs = self.pairs
-            launches, device = self._launches(), pairs.model.device
-            self._executor = Executor(launches, device, pairs.workers, single=True)
-        self._executor.run(1, _never)
+        pairs = self.pairs
+        while True:
+            if self._executor is None:
+                launches, device = self._launches(), pairs.model.device
+                self._executor = Executor(launches, device, pairs.workers, single=True)
+            self._executor.run(1, _never)
+            if pairs.native or pairs.pair_count <= self.room:
+                break
+            self.room = min(pairs.pair_capacity, math.ceil(GROWTH * pairs.pair_count))
+            self.close()
         self.count += 1
         return not bool(self.short.numpy()[0])
 
@@ -203,31 +214,30 @@ class Pruning:
 
     def _plain_launches(self) -> list[Launch | Call]:
         pairs, model, state = self.pairs, self.pairs.model, self.pairs.state
-        size, segments = pairs.pair_capacity, model.segment_count
-        wide = (self.wide_i, self.wide_j, self.wide_image)
+        segments, room = model.segment_count, self.room
+        wide = (self.wide_start, self.wide_j, self.wide_image)
         bits = max(1, math.ceil(math.log2(segments + 1)))
 
         def scan() -> None:
-            wp.utils.array_scan(self.near, self.near_end, inclusive=True)
+            wp.utils.array_scan(self.near_count, self.near_end, inclusive=True)
 
         def sort() -> None:
-            wp.utils.radix_sort_pairs(pairs.in_key, pairs.in_pair, size, 0, bits)
+            wp.utils.radix_sort_pairs(pairs.in_key, pairs.in_pair, room, 0, bits)
 
-        mark = [pairs.skin_out, model.segment_node, self.lattice, self.wide_total, *wide]
-        listed = [pairs.pair_i, pairs.pair_j, pairs.pair_image, pairs.in_key, pairs.in_pair]
-        starts = [state.status, PAIR_COUNT, segments]
-        inputs = {
-            "mark_near": (size, [*mark, state.node_pos, self.near]),
-            "keep_near": (size, [segments, self.near, self.near_end, *wide, *listed, state.status]),
-            "out_start": (size + 1, [*starts, pairs.pair_i, pairs.out_start]),
-            "in_start": (size + 1, [*starts, pairs.in_key, pairs.in_start]),
-        }
-        mark_near, keep_near, out_start, in_start = (
-            Launch(name, self.kernels.get(name, pairs.kernels["mark_starts"]), dim, values)
-            for name, (dim, values) in inputs.items()
-        )
-        calls = Call("scan", scan), Call("sort", sort)
-        return [mark_near, calls[0], keep_near, out_start, calls[1], in_start]
+        mark = [pairs.skin_out, model.segment_node, self.lattice, *wide, state.node_pos]
+        kept = [pairs.out_start, pairs.pair_i, pairs.pair_j, pairs.pair_image]
+        keep = [segments, room, self.near, self.near_end, *wide, *kept, pairs.in_key, pairs.in_pair]
+        starts = [state.status, PAIR_COUNT, segments, pairs.in_key, pairs.in_start]
+        kernels = self.kernels
+        return [
+            Launch(
+                "mark_near", kernels["mark_near"], segments, [*mark, self.near, self.near_count]
+            ),
+            Call("scan", scan),
+            Launch("keep_near", kernels["keep_near"], max(segments, room), [*keep, state.status]),
+            Call("sort", sort),
+            Launch("in_start", kernels["mark_starts"], room + 1, starts),
+        ]
 
 
 def _never() -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.passes.executor import Launch
+from warpfiber.passes.native_friction import RUB_NUMBERS
 from warpfiber.passes.native_relaxation import BEGIN, END, PARTS, REST, ROWS
 from warpfiber.passes.native_row_order import ROW_NUMBERS, STATE_NUMBERS, STILL
 from warpfiber.passes.relaxation_work import relaxation_struct
@@ -48,6 +49,11 @@ def relaxation_work(
     names = "count out_start i j s t normal base compliance force".split()
     for name in names:
         setattr(work, f"row_{name}", getattr(rows, f"row_{name}"))
+    if rows.rub is not None:
+        work.friction = rows.rub.friction.fibers
+        work.wall_friction = rows.rub.friction.walls
+        work.row_slip, work.row_friction = rows.rub.slip, rows.rub.force
+        work.row_rub = zeros(RUB_NUMBERS * capacity, p.real)
     work.row_place = zeros(ROW_NUMBERS * capacity, p.real)
     work.row_state = zeros(STATE_NUMBERS * capacity, p.real)
     work.in_start, work.in_row = zeros(fibers + 2), zeros(capacity)

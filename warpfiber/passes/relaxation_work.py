@@ -49,6 +49,12 @@ def relaxation_struct(name: str) -> Any:
         row_base: wp.array(dtype=real)
         row_compliance: wp.array(dtype=real)
         row_force: wp.array(dtype=real)
+        # with friction: coefficients, slip without contact and tangential forces
+        friction: real
+        wall_friction: real
+        row_slip: wp.array(dtype=vec3)
+        row_friction: wp.array(dtype=vec3)
+        row_rub: wp.array(dtype=real)
         # work: rows, rows by partner, places of the fibers, parts, and the queue of fibers
         row_place: wp.array(dtype=real)
         row_state: wp.array(dtype=real)

@@ -3,6 +3,7 @@
 Source: `native_relaxation`; the response of `rod_response`: a force f along n at the fraction s of
     a rod moves its ends 0 and 1 by m - d and m + d,
         m = dt f n/xi,  d = dt H^2 (2 s - 1) f (I - p p^T) n/K_r
+    with friction also about its axis, by dt tau/(8 pi eta a^3 w) of the torque tau.
 Symbols: as in `rod_response`.
 """
 
@@ -15,11 +16,11 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.native_relaxation import BEGIN, relaxation_text
 from warpfiber.passes.relaxation_work import make_relaxation_begin, relaxation_struct
 
-ROD_NUMBERS = 6  # of every rod
+ROD_NUMBERS = 6  # of every rod, with friction one more
 MOTION = 8  # numbers of two nodes
 
 RODS = """
-    struct Rod { Q axis; T push, twist; };
+    struct Rod { Q axis; T push, twist ROLL; };
     static_assert(sizeof(Rod) == ROD_NUMBERS * sizeof(T), "");
     Rod* const rods = (Rod*)rod_numbers.data;
     auto size_of = [](int) -> int { return MOTION; };
@@ -35,7 +36,7 @@ RODS = """
         rods[f].axis = axis * (T(1) / wp::sqrt(dot(axis, axis)));
         rods[f].push = dt / (g.drag * beads);
         rods[f].twist = dt * reach * reach / turning;
-    };
+SET_FRICTION    };
     // m and d by a unit force of row r on the rod at its side
     struct Move { Q middle, turn; };
     auto move_by = [&](int f, int r, int side) -> Move {
@@ -71,15 +72,39 @@ RODS = """
     auto leave = [](int, const T*) {};
 """
 
+FRICTION = """
+    T reply[MOTION];
+    auto rub_column = [&](int f, int r, int side, int c) -> const T* {
+        const Rod& rod = rods[f];
+        const Pull pull = pull_of(r, side, c == 0 ? rubs[r].first : rubs[r].second);
+        const T lever = T(2) * (side == 0 ? rows[r].s : rows[r].t) - T(1);
+        const Q across = lever * pull.whole + T(2) * pull.couple;
+        const Q turn = rod.twist * (across - dot(rod.axis, across) * rod.axis);
+        const Q middle = rod.push * pull.whole;
+        ((Q*)reply)[0] = middle - turn;
+        ((Q*)reply)[1] = middle + turn;
+        reply[3] = rod.roll * pull.torque;
+        return reply;
+    };
+"""
+
 
 @cache
-def make_rod_relaxation(name: str, law: str, module: str = "unique") -> Any:
+def make_rod_relaxation(name: str, law: str, module: str = "unique", friction: bool = False) -> Any:
     """Kernel `rod_relax` (see `native_relaxation` for its stages): forces of all rows, shifts."""
     Relaxation = relaxation_struct(name)
     begin_solve = make_relaxation_begin(name)
-    rods = RODS.replace("ROD_NUMBERS", str(ROD_NUMBERS)).replace("MOTION", str(MOTION))
+    parts = {
+        "ROD_NUMBERS": str(ROD_NUMBERS + friction),
+        "MOTION": str(MOTION),
+        "ROLL": ", roll" if friction else "",
+        "SET_FRICTION": "rods[f].roll = dt / (g.torque * weight);\n" if friction else "",
+    }
+    rods, rubs = RODS, FRICTION.replace("MOTION", str(MOTION)) if friction else None
+    for key, value in parts.items():
+        rods = rods.replace(key, value)
 
-    @wp.func_native(relaxation_text(name, law, rods))
+    @wp.func_native(relaxation_text(name, law, rods, friction=rubs))
     def relax_rods(
         stage: wp.int32,
         part: wp.int32,

@@ -21,6 +21,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
 from warpfiber.passes.rod_relaxation import MOTION, ROD_NUMBERS, make_rod_relaxation
+from warpfiber.passes.rub_response import rod_rub, rub_clear
 from warpfiber.passes.unilateral import ContactDual
 
 
@@ -153,8 +154,8 @@ class RodResponse:
         self.end_diagonal = wp.zeros(0, dtype=model.precision.real, device=model.device)
 
     def begin(self, dual: ContactDual) -> list[Launch | Call]:
-        """Nothing."""
-        return []
+        """Nothing, but with friction."""
+        return [rub_clear(dual)] if dual.rubs else []
 
     def end(self, dual: ContactDual) -> list[Launch | Call]:
         """Nothing: the last update leaves the shift."""
@@ -162,6 +163,8 @@ class RodResponse:
 
     def repeat(self, dual: ContactDual) -> Launch:
         """Forces gathered and shifts of both ends."""
+        if dual.rubs:
+            return rod_rub(dual)
         model, rows = dual.model, dual.rows
         inputs = [
             dual.step_size,
@@ -188,9 +191,9 @@ class RodResponse:
         sizes = np.full(model.fiber_count, MOTION)
         ends = wp.zeros(model.fiber_count + 1, dtype=wp.int32, device=model.device)
         work = relaxation_work(dual, ends, sizes, self.parts)
-        numbers = ROD_NUMBERS * model.fiber_count
+        numbers = (ROD_NUMBERS + dual.rubs) * model.fiber_count
         rods = wp.zeros(numbers, dtype=model.precision.real, device=model.device)
-        kernel = make_rod_relaxation(model.precision.name, dual.law.kind, dual.module)
+        kernel = make_rod_relaxation(model.precision.name, dual.law.kind, dual.module, dual.rubs)
         return [*relaxation_launches(kernel, work, [dual.step_size, rods])]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:

@@ -38,6 +38,7 @@ class RowFeatures:
     walls: tuple[bool, bool, bool] = (False, False, False)
     lubrication: str = "none"  # none, paper, shifted
     arrays: bool = False  # some walls are arrays of fibers
+    chosen: bool = False  # rows of some segments alone
 
 
 @cache
@@ -106,6 +107,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
+        segment_chosen: wp.array(dtype=wp.uint8),
         pair_slots_out: wp.array(dtype=wp.uint8),
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
@@ -114,6 +116,12 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
+        if wp.static(features.chosen):
+            if segment_chosen[i] == wp.uint8(0):
+                segment_rows_out[i] = 0
+                for k in range(out_start[i], out_start[i + 1]):
+                    pair_row_count_out[k] = 0
+                return
         node_i = segment_node[i]
         xi = node_back[node_i]
         a = node_back[node_i + 1] - xi

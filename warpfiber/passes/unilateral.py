@@ -28,6 +28,7 @@ from warpfiber.passes.dual_rows import (
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.row_slip import RowSlip
 
 ROW_CHUNKS = 16  # runs of rows on the CPU: enough for the workers, few sums to add
 CUDA_CHUNKS = 16384, 32  # on CUDA, where their sums are folded before they are added
@@ -47,6 +48,7 @@ class Rows(Protocol):
     row_compliance: Any
     row_force: Any
     row_out_start: Any
+    rub: RowSlip | None  # with friction
     pair_row: Any
     pair_row_count: Any
 
@@ -120,6 +122,8 @@ class ContactDual:
         self.tolerance, self.most = tolerance, most
         self.law = law or ContactLaw()
         self.relaxes = response.relaxes if relaxes is None else relaxes
+        self.rubs = rows.rub is not None
+        self.by_ends = response.by_ends and not self.rubs
         device = model.device
         self.has_frozen = fiber_frozen is not None
         none = wp.zeros(0, dtype=wp.uint8, device=device)
@@ -129,8 +133,9 @@ class ContactDual:
             model.precision.name,
             self.law.kind,
             self.has_frozen,
-            response.by_ends,
+            self.by_ends,
             self.relaxes,
+            *(("friction",) if rows.rub is not None else ()),
         )
         self.node_shift = wp.zeros(model.node_count, dtype=model.precision.vec3, device=device)
         pushed = model.node_count if tells_push and self.relaxes else 0
@@ -162,6 +167,18 @@ class ContactDual:
         self.row_contact = reals(capacity if self.law.kind == "exponential" else 0)
         self.row_weight, self.row_best = reals(), reals()
         self.row_balance, self.row_change = reals(), reals()
+        rubs, model, vec3 = capacity if self.rubs else 0, self.model, self.model.precision.vec3
+        if self.rubs:  # a gather leaves the forces on the nodes
+            self.node_push = wp.zeros(model.node_count, dtype=vec3, device=device)
+        # by contact, about the axis
+        self.fiber_turn = reals(model.fiber_count if self.rubs else 0)
+        self.row_mu, self.row_slip_weight = reals(rubs), reals(rubs)
+        self.row_slip_now, self.row_friction_best, self.row_friction_change = (
+            wp.zeros(rubs, dtype=vec3, device=device) for _ in range(3)
+        )
+        none = wp.zeros(0, dtype=vec3, device=device)
+        rub = self.rows.rub
+        self.row_slip, self.row_friction = (none, none) if rub is None else (rub.slip, rub.force)
 
     def launches(self) -> list[Launch | Call | Repeat]:
         """Begin, lists and the repeated updates of one solve."""
@@ -208,9 +225,17 @@ class ContactDual:
             self.best,
             self.control,
             self.going,
+            rows.rub.friction.fibers if rows.rub is not None else 0.0,
+            rows.rub.friction.walls if rows.rub is not None else 0.0,
+            self.row_friction,
+            self.row_mu,
+            self.row_slip_weight,
+            self.row_slip_now,
+            self.row_friction_best,
+            self.row_friction_change,
         ]
         name = model.precision.name
-        kernel = make_dual_begin(name, self.law.kind, self.has_frozen, self.module)
+        kernel = make_dual_begin(name, self.law.kind, self.has_frozen, self.module, self.rubs)
         return Launch("dual_begin", kernel, self.chunks, inputs, split=True)
 
     def _lists(self) -> Launch:
@@ -247,12 +272,19 @@ class ContactDual:
             self.row_change,
             self.best,
             self.control,
+            rows.row_normal,
+            self.row_friction,
+            self.row_mu,
+            self.row_slip_weight,
+            self.row_slip_now,
+            self.row_friction_best,
+            self.row_friction_change,
         ]
-        kernel = make_dual_step(self.model.precision.name, self.module)
+        kernel = make_dual_step(self.model.precision.name, self.module, self.rubs)
         return Launch("dual_step", kernel, self.chunks, inputs, split=True)
 
     def _balance(self) -> Launch:
-        rows = self.rows
+        model, rows = self.model, self.rows
         inputs = [
             self.chunks,
             self.law.stiffness,
@@ -277,9 +309,22 @@ class ContactDual:
             self.best,
             self.control,
             self.going,
+            model.groups,
+            model.fiber_group,
+            model.segment_fiber,
+            self.node_start,
+            self.fiber_turn,
+            rows.row_i,
+            rows.row_j,
+            self.row_slip,
+            self.row_friction,
+            self.row_mu,
+            self.row_slip_weight,
+            self.row_slip_now,
+            self.row_friction_change,
         ]
-        name, by_ends = self.model.precision.name, self.response.by_ends
-        kernel = make_dual_balance(name, self.law.kind, by_ends, self.module)
+        name = model.precision.name
+        kernel = make_dual_balance(name, self.law.kind, self.by_ends, self.module, self.rubs)
         return Launch("dual_balance", kernel, self.chunks, inputs, split=True)
 
     # -- what is told -----------------------------------------------------------------------------

@@ -43,15 +43,6 @@ FLOWING = (
     Row("stage", "end_volume_fraction", (), "end the stage by end_strain or end_time"),
     Row("stage", "end_pressure", (), "end the stage by end_strain or end_time"),
     Row("stage", "save", (False,), "remove it; a run can be resumed from its checkpoints"),
-    Row(
-        "contact", "friction", (0.0,), "remove it; contacts are frictionless but in bonded_spheres"
-    ),
-    Row(
-        "contact",
-        "wall_friction",
-        (0.0,),
-        "remove it; walls are frictionless but in bonded_spheres",
-    ),
     Row("record", "node_fields", ("velocity",), "remove it; it is of method bonded_spheres"),
 )
 SOFT = Row("contact", "law", ("none", "exponential", "linear"),
@@ -60,6 +51,10 @@ SOFT = Row("contact", "law", ("none", "exponential", "linear"),
 NOT_IN_METHOD: dict[str, tuple[Row, ...]] = {
     "bead_chain": (
         *FLOWING,
+        Row("contact", "friction", (0.0,),
+            'remove it; repulsion is frictionless, use method = "overdamped" or "rigid_rod"'),
+        Row("contact", "wall_friction", (0.0,),
+            'remove it; walls are frictionless, use method = "overdamped" or "rigid_rod"'),
         Row("fibers", "inextensible", (False,),
             'use method = "overdamped"; or remove it: axial_modulus sets the stretch'),
         Row("contact", "law", ("none", "exponential"),

@@ -291,6 +291,12 @@ def _check_contact(draft: Draft) -> None:
     if draft.contact["law"] == "none" and draft.axes("wall"):
         remedy = 'walls push by contact; use law = "exponential", or no wall in box.boundary'
         draft.blame("contact.law", remedy)
+    for key in ("friction", "wall_friction"):
+        if draft.contact[key] and draft.numerics["contact"] == "penalty":
+            remedy = 'penalties are frictionless; use numerics.contact = "unilateral"'
+            draft.blame(f"contact.{key}", remedy)
+        elif draft.contact[key] and draft.contact["law"] == "none":
+            draft.note(f'contact.{key} has no effect; contact.law = "none" switches off contact')
     if draft.contact["law"] != "none" and draft.numerics["integrator"] == "bdf2":
         remedy = 'contact needs a method of one step; use "sdirk2", or contact.law = "none"'
         draft.blame("numerics.integrator", remedy)
