@@ -52,6 +52,15 @@ def crossed(
     return start([kind], [lower, upper], numerics=numerics, contact=contact, load=rows, **tables)
 
 
+def by(sim: Simulation, solver: str) -> Simulation:
+    """The same, its rows solved one after the other (`relaxed`) or by passes over all."""
+    for _, dual in sim.method.contact.solves:  # type: ignore[attr-defined]
+        dual.relaxes = solver == "relaxed"
+        if not dual.relaxes and dual.node_push.shape[0] > 0:
+            dual.node_push = dual.node_push[:0]
+    return sim
+
+
 def loads(sim: Simulation) -> tuple[Array, Array, Array]:
     """Normal forces (R,) and tangential ones (R, 3) of the last step; their normals."""
     rows = contact_rows(sim)

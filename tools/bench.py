@@ -174,8 +174,8 @@ def cell_speed(
     simulation = wf.Simulation(scene, device=args.device, workers=args.workers, placement=placement)
     placed = time.perf_counter() - begin
     method, count = simulation.method, simulation.model.segment_count
-    steps = max(20, min(100, 4_000_000 // count))
-    simulation.step(2 * steps)
+    steps = max(20, min(100, 100_000_000 // count))  # of several lists, in cells of all sizes
+    simulation.step(200)  # skins of all sizes have settled
     whole, lists, builds = [], [], method.list.build_count
     pruning, prunes = method.search.prune_seconds, method.search.prune_count
     for _ in range(args.repeats):

@@ -37,6 +37,7 @@ ARCHITECTURE = 80
 FRAMES: dict[str, tuple[int, str]] = {
     "bond_sweep": (40, "sine and cosine, of nodes that turn by more than 0.2 in a step"),
     "bond_drift": (40, "as bond_sweep"),
+    "find_pairs": (768, "lists of waiting midpoints, places in them are known at run time alone"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
 }
 

@@ -12,7 +12,7 @@ import pytest
 
 import warpfiber as wf
 from tests.reference import bonded_spheres as ref
-from tests.rods import start_rods
+from tests.rods import rates, start_rods
 from warpfiber.methods.press import Press
 from warpfiber.scene import SceneError, Stage
 from warpfiber.simulation import Simulation
@@ -102,19 +102,21 @@ def test_a_dashpot_feels_the_speed_of_the_wall() -> None:
     assert np.abs(difference).max() < 1e-9 * speed
 
 
+def layers(damping: float = 0.0335) -> list[ref.Rod]:
+    """Eight crossed fibers, one on the other."""
+    heights = RADIUS + 2.0 * RADIUS * np.arange(8)
+    return [
+        level(z, 2 + 2 * (k % 2), 1.0 * k, damping=damping) for k, z in enumerate(heights.tolist())
+    ]
+
+
 def heap(
     *, stages: list[dict[str, Any]], friction: float = 1.4, damping: float = 0.113, **keys: Any
 ) -> Simulation:
-    """Eight crossed layers of one or two fibers; without weight unless `keys` say so."""
-    rods = []
-    for k in range(8):
-        rod = level(
-            RADIUS + 2.0 * RADIUS * k, 3 + 2 * (k % 2), 1.0 * k, damping=0.0335 * (damping > 0)
-        )
-        rods.append(rod)
+    """Eight crossed fibers; without weight unless `keys` say so."""
     numerics = keys.pop("numerics", {})
     return start_rods(
-        rods,
+        layers(0.0335 * (damping > 0)),
         box=BOX,
         contact={"law": "hertz", "damping": damping, "friction": friction, "wall_friction": 0.6},
         stage=stages,
@@ -156,11 +158,12 @@ def test_work_is_energy(fraction: float) -> None:
     assert np.abs(held - given).max() < 0.03 * fraction * given.max()
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.113])
-def test_no_energy_beyond_the_work(damping: float) -> None:
+@pytest.mark.parametrize(("damping", "most"), [(0.0, 0.03), (0.113, 1e-3)])
+def test_no_energy_beyond_the_work(damping: float, most: float) -> None:
     """A bed pressed at 1 m/s with friction 1.4 and let go has 0.1 % more than the work at most.
 
-    They cross between nodes; at a kink of a bent fiber it is up to 2 %, see `contact_energy`.
+    They cross at their middle nodes. Without dashpots they topple until they lie along each other,
+    where contacts follow from no potential: 2-3 %, see `contact_energy`.
     """
     sim = heap(
         stages=[
@@ -179,26 +182,30 @@ def test_no_energy_beyond_the_work(damping: float) -> None:
             sim.step(min(steps, 20))
             row = sim.measure()
             largest = max(largest, row["wall_work"])
-            assert energy(row) < row["wall_work"] + 1e-3 * largest
+            assert energy(row) < row["wall_work"] + most * largest
     assert largest > 0.0
     sim.begin_stage(Stage(kind="settle", name="settle"))
     for _ in range(20):
         sim.run(time=sim.time + 0.0025)
         row = sim.measure()
-        assert energy(row) < row["wall_work"] + 1e-3 * largest
+        assert energy(row) < row["wall_work"] + most * largest
 
 
-def test_both_walls_feel_the_same() -> None:
-    """Without weight and pressed before it topples, the pressures of both walls agree."""
+def test_walls_and_momentum() -> None:
+    """Without weight, m dv/dt of all nodes is what the lower wall pushes more than the upper one.
+
+    k eps of the forces; the bed bounces between the walls, so that their ratio is nothing fixed.
+    """
     sim = heap(
         stages=[stage("compress", 0.1, end_volume_fraction=0.35)],
         numerics={"dt_fraction": 0.3},
     )
     sim.run()
-    row = sim.measure()
-    # what is left is the momentum of a bed whose mean speed changes: m dv/dt / (A P)
-    assert row["pressure_high"] > 100.0
-    assert row["pressure_low"] == pytest.approx(row["pressure_high"], rel=0.02)
+    low, high = press_of(sim).push.numpy()[0] * sim.model.units.force
+    mass = np.concatenate([rod.mass for rod in layers()])
+    momentum = (mass * rates(sim)[0][:, 2]).sum()
+    assert high > 100.0 * EDGE**2
+    assert abs(low - high - momentum) < 1e-9 * (low + high)
 
 
 SCENE = """

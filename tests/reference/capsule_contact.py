@@ -2,8 +2,8 @@
 
 Source: elliptic Hertz contacts from the sum of two curvature tensors; along a line where fibers are
     within 30 degrees of each other and the patch is longer than half a segment; the vertex rule;
-    shares of minima in the hollow of a kink; Mindlin and Coulomb. Written with eigenvalues and
-    numerical integrals, where the kernels have closed forms.
+    in the hollow of a kink minima less saddles plus maxima; Mindlin and Coulomb. Written with
+    eigenvalues and numerical integrals, where the kernels have closed forms.
 Symbols: x, v, w nodes of both fibers; s, t parts of the two segments; n from the first to the
     second; a memory is (displacement, overlap a step ago), and goes over to the next segment with
     the contact.
@@ -57,6 +57,18 @@ def hertz(laws: Laws, tensors: list[Array], depth: float) -> tuple[float, float]
     return force, 1.5 * force / depth
 
 
+def per_angle(tensors: list[Array], angle: float) -> float:
+    """Logarithmic derivative of a contact's energy by the angle between two crossing cylinders."""
+    small, large = np.linalg.eigvalsh(np.sum(tensors, axis=0))
+    by_product = -0.25
+    if large > small:
+        power = (large / small) ** 0.0684
+        correction = 1.0 - (power - 1.0) ** 1.531
+        by_ratio = 1.5 / correction * 1.531 * (power - 1.0) ** 0.531 * 0.0684 * power
+        by_product -= by_ratio * (large + small) / (large - small)
+    return float(by_product * 2.0 / math.tan(angle))
+
+
 def curvature(radius: float, angle: float | None) -> Array:
     """Of a cylinder whose axis has this angle in the plane; None: of a sphere."""
     if angle is None:
@@ -67,13 +79,19 @@ def curvature(radius: float, angle: float | None) -> Array:
 
 @dataclass
 class Touch:
-    """What one pair of segments does: spring force, stiffness, and where."""
+    """What one pair of segments does: spring force, stiffness, and where.
+
+    springs: (force, s, t) of all extrema that count; along a line there is none but the sum.
+    """
 
     force: float
     stiffness: float
     s: float
     t: float
     depth: float = 0.0
+    springs: list[tuple[float, float, float]] = field(default_factory=list)
+    energy: float = 0.0
+    twist: float = 0.0  # derivative of the energy by the angle from the first to the second
 
 
 def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: float) -> Touch | None:
@@ -133,25 +151,41 @@ def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: floa
     )
 
 
-def hollow(x: Array, vertex: int, beyond: int, other: int) -> bool:
-    """Whether the fiber comes nearer again to the segment `other` beyond one of its nodes."""
-    _, t = closest_points(x[vertex], x[vertex], x[other], x[other + 1])
-    away = x[other] + t * (x[other + 1] - x[other]) - x[vertex]
-    onward = x[beyond] - x[vertex]
-    return bool(away @ onward > NEAR * (onward @ onward))
+def descends(x: Array, vertex: int, towards: int, away: Array) -> bool:
+    """Whether a fiber comes nearer along its edge from a node; away: from the node to the other."""
+    edge = x[towards] - x[vertex]
+    return bool(away @ edge > NEAR * (edge @ edge))
 
 
-def share(
-    x: Array, part: float, segment: int, other: int, ends: tuple[int, int], patch: float
-) -> float:
-    """What is left of a minimum where the neighbor beyond a kink has one in the same patch."""
-    length = float(np.linalg.norm(x[segment + 1] - x[segment]))
-    left = 1.0
-    for vertex, step, far in ((segment, -1, part), (segment + 1, 1, 1.0 - part)):
-        inner = vertex not in ends
-        if inner and far * length < patch and hollow(x, vertex, vertex + step, other):
-            left *= 0.5 + 0.5 * far * length / patch
-    return left
+def extrema(
+    x: Array, i: int, j: int, first: tuple[int, int], last: tuple[int, int]
+) -> list[tuple[float, float, float]]:
+    """(weight, part of i, part of j): halves of saddles and quarters of maxima of two segments."""
+    found = []
+    for side, (segment, other) in enumerate(((i, j), (j, i))):
+        for k in (0, 1):
+            vertex, inner, beyond = segment + k, segment + 1 - k, segment + 3 * k - 1
+            if vertex in (first[side], last[side] + 1):
+                continue
+            _, there = closest_points(x[vertex], x[vertex], x[other], x[other + 1])
+            away = x[other] + there * (x[other + 1] - x[other]) - x[vertex]
+            if not (descends(x, vertex, inner, away) and descends(x, vertex, beyond, away)):
+                continue
+            if there >= 1.0 - NEAR and other < last[1 - side]:
+                continue
+            if there <= NEAR and other > first[1 - side] and descends(x, other, other - 1, -away):
+                continue
+            found.append((-0.5, float(k), there) if side == 0 else (-0.5, there, float(k)))
+    for k, m in itertools.product((0, 1), (0, 1)):
+        ends = (i + k, j + m)
+        if any(end in (low, high + 1) for end, low, high in zip(ends, first, last, strict=True)):
+            continue
+        gap = x[ends[1]] - x[ends[0]]
+        near = [descends(x, ends[0], n, gap) for n in (i + 1 - k, i + 3 * k - 1)]
+        near += [descends(x, ends[1], n, -gap) for n in (j + 1 - m, j + 3 * m - 1)]
+        if all(near):
+            found.append((0.25, float(k), float(m)))
+    return found
 
 
 def touch(laws: Laws, x: Array, i: int, j: int, rods: tuple[Rod, Rod]) -> Touch | None:
@@ -176,19 +210,31 @@ def touch(laws: Laws, x: Array, i: int, j: int, rods: tuple[Rod, Rod]) -> Touch 
         reported &= bool(c @ (x[i] - x[i - 1]) >= 0.0)
     if t <= NEAR and j > first[1]:
         reported &= bool(c @ (x[j] - x[j - 1]) <= 0.0)
-    if not reported:
-        return line if line is not None and line.force > 0.0 else None
+    if line is not None and not reported:
+        return line if line.force > 0.0 else None
     sine = np.linalg.norm(np.cross(a, b)) / np.linalg.norm(a) / np.linalg.norm(b)
     angle = math.asin(min(1.0, max(float(sine), 0.02)))
     tensors = [curvature(ra, None if end_a else 0.0), curvature(rb, None if end_b else angle)]
-    force, stiffness = hertz(laws, tensors, depth)
-    patch = math.sqrt(2.0 * (ra + rb) * depth) / math.sin(angle)
-    part = share(x, s, i, j, (first[0], last[0] + 1), patch)
-    part *= share(x, t, j, i, (first[1], last[1] + 1), patch)
-    force, stiffness = part * force, part * stiffness
-    if line is not None and line.force >= force:
+    if line is not None and line.force >= hertz(laws, tensors, depth)[0]:
         return line
-    return Touch(force, stiffness, s, t, depth)
+    points = [(1.0, s, t)] if reported else []
+    points += extrema(x, i, j, first, last) if line is None else []
+    whole = Touch(0.0, 0.0, s, t, depth)
+    for weight, on_a, on_b in points:
+        deep = ra + rb - float(np.linalg.norm(delta + on_b * b - on_a * a))
+        if deep > 0.0:
+            push, slope = hertz(laws, tensors, deep)
+            whole.force, whole.stiffness = (
+                whole.force + weight * push,
+                whole.stiffness + weight * slope,
+            )
+            whole.energy += 0.4 * weight * push * deep
+            whole.springs.append((weight * push, on_a, on_b))
+    if sine > 0.02 and not (end_a or end_b):
+        whole.twist = whole.energy * per_angle(tensors, math.copysign(angle, float(a @ b)))
+    if not reported:
+        whole.force = whole.stiffness = 0.0
+    return whole if whole.springs else None
 
 
 def memory(laws: Laws, before: Memories, i: int, j: int, found: Touch, x: Array) -> Memory:
@@ -238,6 +284,24 @@ def contact_loads(
         size = found.force + resistance * float(slip @ n)
         size = max(size, 0.0) if laws.clamp else size
         force = -size * n
+        for push, on_i, on_j in found.springs:
+            parts = (np.array([1.0 - on_i, on_i]), np.array([1.0 - on_j, on_j]))
+            gap = parts[1] @ x[nodes[1]] - parts[0] @ x[nodes[0]]
+            spring = push / np.linalg.norm(gap) * gap
+            for side, sign in ((0, -1.0), (1, 1.0)):
+                np.add.at(forces, nodes[side], sign * np.outer(parts[side], spring))
+                if found.force > 0.0:
+                    np.add.at(forces, nodes[side], -sign * np.outer(weights[side], push * n))
+        if found.twist != 0.0:
+            edges = [x[nodes[side][1]] - x[nodes[side][0]] for side in (0, 1)]
+            axis = np.cross(*edges)
+            axis *= found.twist / np.linalg.norm(axis)
+            for side, sign in ((0, 1.0), (1, -1.0)):
+                edge = edges[side]
+                pull = sign * np.cross(axis, edge) / (edge @ edge)
+                np.add.at(forces, nodes[side], np.array([-pull, pull]))
+        if found.force <= 0.0:
+            continue
         if laws.friction > 0.0:
             stiffness = laws.shear_ratio * found.stiffness
             h, old = memory(laws, earlier, i, j, found, x)
@@ -261,3 +325,11 @@ def contact_loads(
             np.add.at(forces, nodes[side], sign * np.outer(weights[side], force))
             np.add.at(moments, nodes[side], np.outer(weights[side], couple))
     return forces, moments
+
+
+def stored_energy(laws: Laws, rods: tuple[Rod, Rod], x: Array) -> float:
+    """Energy of the springs of all points where two fibers touch, J."""
+    count = len(rods[0].rest)
+    pairs = itertools.product(range(count - 1), range(count, len(x) - 1))
+    touches = (touch(laws, x, i, j, rods) for i, j in pairs)
+    return math.fsum(found.energy for found in touches if found is not None)

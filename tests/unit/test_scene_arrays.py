@@ -57,7 +57,7 @@ def test_no_whole_number_is_told() -> None:
         ([ARRAY, ARRAY], {}, "wall.1.name", "wall.0"),
         ([{**ARRAY, "diameter": 1e-3}], {}, "wall.0.diameter", "wider than the box along y"),
         ([{**ARRAY, "velocity": [1, 0, 0]}], {}, "wall.0.velocity", '"flow"'),
-        ([{**ARRAY, "friction": 0.3}], {}, "wall.0.friction", "frictionless"),
+        ([{**ARRAY, "friction": 0.3}], {}, "wall.0.friction", "contact.wall_friction"),
         ([{"name": "z-"}], {}, "wall.0.kind", "box.boundary"),
         (
             [ARRAY],

@@ -36,7 +36,7 @@ def make_capsule_contact(name):
     tiny, far_away = real(1.0e-30), real(1.0e30)
     third, quarter, ninth = real(1.0 / 3.0), real(0.25), real(1.0 / 9.0)
     outermost = real(math.sqrt(0.6))  # of three Gauss points
-    slender, power = real(SLENDER), real(POWER)
+    slender, power, steep = real(SLENDER), real(POWER), real(1.5 * SLENDER * POWER)
 
     @wp.func
     def curvatures(ends: wp.int32, ka: real, kb: real, sine: real) -> vec2:
@@ -51,16 +51,21 @@ def make_capsule_contact(name):
         return vec2(two * total, total * total)
 
     @wp.func
-    def hertz_factor(sp: vec2) -> real:
-        """sqrt(R*) F_2^-1.5."""
+    def hertz_factor(sp: vec2) -> vec2:
+        """f = sqrt(R*) F_2^-1.5, and d ln f / d ln P."""
         difference = wp.sqrt(wp.max(sp[0] * sp[0] - real(4.0) * sp[1], zero))
         # (S + D) / (S - D) without the difference of numbers that are nearly equal
         ratio = (sp[0] + difference) * (sp[0] + difference) / (real(4.0) * sp[1])
         slope = wp.pow(ratio, slender) - one
         correction = one
+        steepness = -quarter
         if slope > zero:
-            correction = one - wp.pow(slope, power)
-        return one / (wp.sqrt(wp.sqrt(sp[1])) * correction * wp.sqrt(correction))
+            lacking = wp.pow(slope, power)
+            correction = one - lacking
+            # d ln rho / d ln P = -S / D
+            steepness -= steep * lacking / (slope * correction) * (one + slope) * sp[0] / difference
+        factor = one / (wp.sqrt(wp.sqrt(sp[1])) * correction * wp.sqrt(correction))
+        return vec2(factor, steepness)
 
     @wp.func
     def side_by_side(delta: vec3, a: vec3, b: vec3) -> vec4:

@@ -54,11 +54,6 @@ class BondedContacts:
             pair_cost=pair_cost,
         )
         p, device = model.precision, model.device
-        # whether another segment of the same fiber begins where one ends
-        fiber, after = model.host["segment_fiber"], model.host["segment_end"]
-        closing = after != model.host["segment_node"] + 1
-        goes_on = np.append(fiber[1:] == fiber[:-1], False) | closing
-        self.segment_goes_on = wp.array(goes_on.astype(np.uint8), dtype=wp.uint8, device=device)
         # scratch of the sweep over bonds, zero between steps
         self.node_force = wp.zeros(model.node_count, dtype=p.vec3, device=device)
         self.node_moment = wp.zeros(model.node_count, dtype=p.vec3, device=device)
@@ -72,6 +67,8 @@ class BondedContacts:
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
+        self.bends = wp.zeros(size, dtype=wp.uint8, device=device)  # acts beside a contact
+        self.beside = wp.zeros(size, dtype=p.mat33, device=device)
         self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
         self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)
         self.hit_count = wp.zeros(part_count(size, str(device)), dtype=wp.int32, device=device)

@@ -73,7 +73,6 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         p.real(REACH_MARGIN * pairs.reach),
         model.segment_node,
         model.segment_end,
-        contacts.segment_goes_on,
         state.lattice_now,
         pairs.pair_i,
         pairs.pair_j,
@@ -81,6 +80,7 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         spheres.place,
         state.status,
         contacts.acts,
+        contacts.bends,
         *hits,
     ]
     near = Launch("hits", make_capsule_hits(p.name, contacts.features), parts, inputs, split=True)
@@ -110,6 +110,8 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         contacts.force,
         contacts.moment,
         contacts.arms,
+        contacts.bends,
+        contacts.beside,
         contacts.memory,
         contacts.written,
         state.status,
@@ -125,11 +127,13 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
     gathered: list[Any] = [*[none_i] * 5, spheres.pair_acts, none_3, none_3]
-    gathered += [wp.zeros(0, dtype=p.vec4, device=model.device), none_i, none_3, none_3]
+    kinds = (p.vec4, wp.uint8, p.mat33, wp.int32, p.vec3, p.vec3)
+    gathered += [wp.zeros(0, dtype=kind, device=model.device) for kind in kinds]
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts
         gathered = [pairs.out_start, pairs.in_start, pairs.in_pair, pairs.pair_i, pairs.pair_j]
         gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
+        gathered += [contacts.bends, contacts.beside]
         gathered += [contacts.acting, contacts.node_force, contacts.node_moment]
     inputs = [
         p.real(spheres.dt),

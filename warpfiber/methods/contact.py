@@ -2,7 +2,8 @@
 
 Between the motion without contact and the end of the step: does the list hold every pair that may
 meet, rows at the start of the step, their forces, the motion that these cause, and a look at the
-result. With two linearizations, rows of the result push once more against what is left.
+result. With two linearizations, rows of the result push once more against what is left; of packed
+fibers those do that the first left overlapping (`passes/overlap_choice`).
 Source: non-penetration as a complementarity of gaps and forces (`passes/unilateral`); a step whose
     result overlaps by more than OVERLAP or in which center lines passed each other is taken again,
     shorter (`passes/contact_verdict`).
@@ -27,7 +28,7 @@ from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.overlap_choice import OverlapChoice
-from warpfiber.passes.row_slip import Friction
+from warpfiber.passes.row_slip import Friction, RowSlip
 from warpfiber.passes.step_control import HALVE
 from warpfiber.passes.unilateral import ContactDual, ContactLaw, Response
 from warpfiber.scene import Fault, Scene, SceneError
@@ -55,6 +56,9 @@ SKIN_BENT = 5.0  # diameters, where a few fibers of many spring farther than the
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
 FINITE = 1e20  # radii; penalties may overlap
+SLIDES = (
+    1e-5  # a contact slides whose force of friction is so near to its limit, rounding of float32
+)
 Launches = list[Launch | Call | Repeat]
 
 
@@ -297,15 +301,29 @@ class ImplicitContact:
             rows.restore({key[len(head) :]: arrays[key] for key in arrays if key.startswith(head)})
 
     def report(self) -> dict[str, float]:
-        """Rows, updates and largest fault (radii) of the last step; unsolved so far."""
+        """Rows, updates and largest fault (radii) of the last step; unsolved so far.
+
+        With friction `sliding_contacts`, the share of loaded contacts that slide.
+        """
         rows, dual = self.solves[0]
         radius = min(row["radius"] for row in self.model.group_rows)
-        return {
+        sliding = {} if rows.rub is None else {"sliding_contacts": self._sliding(rows, rows.rub)}
+        return sliding | {
             "rows": int(rows.row_count.numpy()[0]),
             "updates": dual.updates,
             "fault": dual.fault / radius,
             "unsolved_contacts": self.unsolved,
         }
+
+    @staticmethod
+    def _sliding(rows: ContactRows, rub: RowSlip) -> float:
+        count = int(rows.row_count.numpy()[0])
+        force = rows.row_force.numpy()[:count].astype(float)
+        flat = np.linalg.norm(rub.force.numpy()[:count].astype(float), axis=1)
+        mu = np.where(rows.row_j.numpy()[:count] < 0, rub.friction.walls, rub.friction.fibers)
+        dry = (force > 0.0) & (rows.row_compliance.numpy()[:count] == 0.0)
+        slides = flat[dry] > (1.0 - SLIDES) * mu[dry] * force[dry]
+        return float(slides.mean()) if len(slides) else 0.0
 
     @property
     def unsolved(self) -> int:

@@ -11,7 +11,7 @@ import warp as wp
 from warpfiber.methods.bonded_contacts import BondedContacts
 from warpfiber.methods.bonded_launches import REACH_MARGIN
 from warpfiber.passes.executor import Executor, Launch
-from warpfiber.passes.native_capsules_source import LANES, PARTS
+from warpfiber.passes.native_capsules_source import PARTS, READ_AHEAD
 from warpfiber.passes.near_pairs import LEAST, make_near_pairs, part_starts
 from warpfiber.passes.node_blocks import NodeBlocks
 
@@ -46,7 +46,7 @@ class NearPairs:
 
     def _allocate(self) -> None:
         device = self.spheres.model.device
-        size = self.contacts.search.list.pair_capacity + 2 * LANES  # sweeps read ahead
+        size = self.contacts.search.list.pair_capacity + READ_AHEAD
         self.pair = wp.zeros(size, dtype=wp.int32, device=device)
         self.i = wp.zeros(size, dtype=wp.int32, device=device)
         self.j = wp.zeros(size, dtype=wp.int32, device=device)
@@ -93,7 +93,7 @@ class NearPairs:
 
     def find(self) -> None:
         """Near pairs of the skins that were chosen; the list may be a new one."""
-        if self.pair.shape[0] != self.contacts.search.list.pair_capacity + 2 * LANES:
+        if self.pair.shape[0] != self.contacts.search.list.pair_capacity + READ_AHEAD:
             self.close()
             self._allocate()
         self._run(1)

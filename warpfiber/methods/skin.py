@@ -9,8 +9,8 @@ Where the list is pruned from a wider one (`passes.pruning`), the skin and the n
 it is used up before the cells are searched again are chosen together. Measured as sums of parts
 (20,000 segments of 5 diameters, V_f = 0.1, SIMD, strain 0.001 per step; ns per segment-step of list
 and pair sweep, skins in diameters): one list 26 with a skin of 0.6 (build 249, every 15 steps,
-sweep 9.4), 25 of 0.8; a wide one of 1.2 (build 348, every 32 steps) and one of 0.3 pruned from it
-(21, every 7 steps, sweep 5.9) 20. Skins and extensions by the speed of each segment last 18 steps
+sweep 9.4), 25 of 0.8; a wide one of 0.9 (build 235, every 30 steps) and one of 0.2 pruned from it
+(19, every 6 steps, sweep 5.9) 17. Skins and extensions by the speed of each segment last 18 steps
 with the pairs that one skin needs for 14: few fibers, pushed by others, end any list (with half as
 many pairs 21 of the 20,000 segments in 20 steps, 136 in 40), so that such skins pay only if these
 are listed anew on their own.
@@ -41,7 +41,7 @@ class ListCosts:
 
 
 # Measured with vectors, and without; those of a GPU are not known.
-SIMD_COSTS = ListCosts(110.0, 95.0, 62.0, 104.0, 15.0, 12.0, 6.5)
+SIMD_COSTS = ListCosts(110.0, 95.0, 90.0, 60.0, 32.0, 10.0, 7.0)
 PLAIN_COSTS = ListCosts(340.0, 200.0, 280.0, 160.0, 38.0, 26.0, 19.0)
 PAIR_COST, PLAIN_PAIR_COST = 11.0, 21.0  # of one more listed pair in an explicit step
 START_SKIN, LEAST_SKIN, MOST_SKIN = 0.3, 0.15, 2.0  # diameters
@@ -49,7 +49,7 @@ RATIO = 1.1  # of neighboring choices
 WORTH = 0.97  # another skin must cost less than this part of the present one
 LARGEST_CHANGE = 1.5  # of one build
 LASTING = 1.3  # uses of a step that a skin must have room for
-START_TIMES, MOST_PRUNED = 2, 12  # skins used up before cells are searched again
+START_TIMES, MOST_PRUNED = 3, 12  # skins used up before cells are searched again
 UNEVEN = 1.1  # what a wide list holds more, since skins are used up unevenly
 MEMORY = 0.5  # weight of the use before in the mean
 # Measured: listed pairs grow with the volume from this part of the distance in contact on.
@@ -147,8 +147,9 @@ class SkinChoice:
 
     def first_margin(self) -> float:
         """As long as nothing is known."""
-        has_room = self._margin(self.skin, START_TIMES) <= self.largest - self.skin
-        return self._margin(self.skin, START_TIMES if has_room else 1)
+        room = self.largest - self.skin
+        margins = (self._margin(self.skin, times) for times in range(START_TIMES, 0, -1))
+        return next(margin for margin in margins if margin <= room)
 
     def choose_margin(self, skin: float, pairs_per_segment: float) -> float:
         """Margin of the wide list beyond this skin, with these pairs at the present one."""

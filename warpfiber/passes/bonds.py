@@ -54,7 +54,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     Without `kicks` too: only the accelerations of the start.
     """
     p = precision(name)
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
     Node = node_struct(name)
     bond_loads, _, bond_dashpots = make_bond(name)
@@ -141,6 +141,8 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         pair_force: wp.array(dtype=vec3),
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        pair_bends: wp.array(dtype=wp.uint8),
+        pair_beside: wp.array(dtype=mat33),
         pair_acting: wp.array(dtype=wp.int32),
         contact_force: wp.array(dtype=vec3),
         contact_moment: wp.array(dtype=vec3),
@@ -188,6 +190,8 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 pair_force,
                 pair_moment,
                 pair_arms,
+                pair_bends,
+                pair_beside,
                 pair_acting,
                 contact_force,
                 contact_moment,

@@ -1,21 +1,19 @@
 """Which listed pairs of segments may touch now, packed for the sweep over contacts.
 
-Most listed pairs are apart or leave the contact to the next pair along a fiber. Which ones do not
-can hardly be foreseen by a processor, so nothing branches here: every pair writes itself, and the
-place of the next one moves on only behind those that may touch. Pairs are cut into parts, one per
-thread; on CUDA a part is a pair.
-Source: law `segment_distance`; the vertex rule of `capsule_touch` at the far ends of segments.
+Most listed pairs are apart. Which ones are not can hardly be foreseen by a processor, so nothing
+branches here: every pair writes itself, and the place of the next one moves on only behind those
+that may touch. Pairs are cut into parts, one per thread; on CUDA a part is a pair.
+Source: law `segment_distance`.
 """
 
 from functools import cache
 
 import warp as wp
 
-from warpfiber.laws.capsule_contact import ALIGNED
 from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.kernel_module import FUSED
-from warpfiber.passes.pairs import END_TOLERANCE, PairFeatures, make_pair_geometry
+from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 
 PART = 64  # pairs of a part on the CPU, where the list is full
 
@@ -39,7 +37,6 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
     is_closed = features.closed
-    far_end, aligned = real(1.0 - END_TOLERANCE[name]), real(ALIGNED)
 
     @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def capsule_hits(
@@ -48,7 +45,6 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
         largest_reach: real,
         segment_node: wp.array(dtype=wp.int32),
         segment_end: wp.array(dtype=wp.int32),
-        segment_goes_on: wp.array(dtype=wp.uint8),
         lattice: wp.array(dtype=mat33),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
@@ -56,6 +52,7 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
         place: wp.array(dtype=wp.vec3d),
         status: wp.array(dtype=wp.int32),
         pair_acts_out: wp.array(dtype=wp.uint8),
+        pair_bends_out: wp.array(dtype=wp.uint8),
         hit_pair_out: wp.array(dtype=wp.int32),
         hit_closest_out: wp.array(dtype=vec2),
         hit_count_out: wp.array(dtype=wp.int32),
@@ -83,16 +80,11 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
-            # at the far end of a segment that goes on the next one has the contact of a point
-            ab = wp.dot(a, b)
-            is_point = wp.where(ab * ab > aligned * wp.length_sq(a) * wp.length_sq(b), 0, 1)
-            at_next = wp.where(st[0] >= far_end, wp.int32(segment_goes_on[i]), 0)
-            at_next |= wp.where(st[1] >= far_end, wp.int32(segment_goes_on[j]), 0)
-            is_near = wp.where(wp.length_sq(c) < largest_reach * largest_reach, 1, 0)
             pair_acts_out[k] = wp.uint8(0)
+            pair_bends_out[k] = wp.uint8(0)
             hit_pair_out[found] = k
             hit_closest_out[found] = st
-            found += is_near & (1 - (is_point & at_next))
+            found += wp.where(wp.length_sq(c) < largest_reach * largest_reach, 1, 0)
         hit_count_out[part] = found - begin
 
     return capsule_hits

@@ -106,6 +106,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_force_out: wp.array(dtype=vec3),
         pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
+        pair_bends: wp.array(dtype=wp.uint8),
+        pair_beside_out: wp.array(dtype=mat33),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -138,9 +140,12 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             reach = gi.radius + gj.radius
             if wp.length_sq(c) >= reach * reach:
                 continue
-            push, depth, _energy = normal_contact(
+            push, depth, _energy, beside = normal_contact(
                 gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
             )
+            if wp.ddot(beside, beside) > zero:
+                pair_bends[k] = wp.uint8(1)
+                pair_beside_out[k] = beside
             if push[0] <= zero:
                 continue
             s = push[2]
@@ -213,7 +218,7 @@ def make_gather(name: str, closed: bool):
     takes three times as long, most of it for ends of loops that no processor foresees.
     """
     p = precision(name)
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     one = real(1.0)
 
     @wp.func
@@ -231,6 +236,8 @@ def make_gather(name: str, closed: bool):
         pair_force: wp.array(dtype=vec3),
         pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        pair_bends: wp.array(dtype=wp.uint8),
+        pair_beside: wp.array(dtype=mat33),
         acting: wp.array(dtype=wp.int32),
         node_force: wp.array(dtype=vec3),
         node_moment: wp.array(dtype=vec3),
@@ -239,33 +246,43 @@ def make_gather(name: str, closed: bool):
         found = begin
         for k in range(out_start[first_segment], out_start[end_segment]):
             acting[found] = k
-            found += wp.int32(pair_acts[k])
+            found += wp.int32(pair_acts[k] | pair_bends[k])
         incoming = found
         for slot in range(in_start[first_segment], in_start[end_segment]):
             k = in_pair[slot]
             acting[found] = k
-            found += wp.int32(pair_acts[k])
+            found += wp.int32(pair_acts[k] | pair_bends[k])
         for slot in range(begin, found):
             k = acting[slot]
-            arms = pair_arms[k]
-            force = pair_force[k]
             segment = pair_i[k]
-            part = arms[0]
-            arm = arms[2]
             if slot >= incoming:
                 segment = pair_j[k]
-                force = -force
-                part = arms[1]
-                arm = arms[3]
-            moment = arm * pair_moment[k]
             node = first + segment - first_segment
             end = node + 1
             if wp.static(closed):
                 if node == last:
                     end = first
-            node_force[node] += (one - part) * force
-            node_moment[node] += (one - part) * moment
-            node_force[end] += part * force
-            node_moment[end] += part * moment
+            if pair_acts[k] != wp.uint8(0):
+                arms = pair_arms[k]
+                force = pair_force[k]
+                part = arms[0]
+                arm = arms[2]
+                if slot >= incoming:
+                    force = -force
+                    part = arms[1]
+                    arm = arms[3]
+                moment = arm * pair_moment[k]
+                node_force[node] += (one - part) * force
+                node_moment[node] += (one - part) * moment
+                node_force[end] += part * force
+                node_moment[end] += part * moment
+            if pair_bends[k] != wp.uint8(0):
+                beside = pair_beside[k]
+                if slot < incoming:
+                    node_force[node] += beside[0]
+                    node_force[end] += beside[1]
+                else:
+                    node_force[node] += beside[2]
+                    node_force[end] -= beside[0] + beside[1] + beside[2]
 
     return gather_pairs

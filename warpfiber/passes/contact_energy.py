@@ -5,10 +5,8 @@ segment, so they do not depend on the number of workers.
 Source: laws `capsule_contact` and `friction`. A force F does the work F . v dt with v the velocity
     after the second half kick, since nodes have v - a dt / 2 before and v + a dt / 2 after it.
     Friction dissipates what is put in against it less what its memories store.
-Limits: the shares that the minima beside a kink have in one patch (`capsule_touch`) go with how far
-    these are from the node, and no force goes with that: two fibers that bend around each other at
-    their nodes gain 2 % of the energy of an impact, whatever dt. Pushes along partial lines follow
-    from no potential either.
+Limits: pushes along partial lines follow from no potential, nor does the change from lines to
+    points and to the ends of fibers: beds without friction and dashpots gain some percent by it.
 """
 
 from functools import cache
@@ -121,12 +119,12 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
                 reach = gi.radius + gj.radius
                 if wp.length_sq(delta + st[1] * b - st[0] * a) >= reach * reach:
                     continue
-                push, _depth, stored = normal_contact(
+                push, _depth, stored, _beside = normal_contact(
                     gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
                 )
+                normal += wp.float64(stored)
                 if push[0] <= zero:
                     continue
-                normal += wp.float64(stored)
                 if wp.static(has_friction):
                     if pair_step[now & 1, k] == now:
                         kept = pair_memory[now & 1, k]

@@ -15,7 +15,7 @@ from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-from warpfiber.passes.native_capsules_source import PARTS
+from warpfiber.passes.native_capsules_source import LARGE, PARTS
 
 LANES = 8  # fibers, in both precisions
 LOADS, END, BEGIN = 1, 2, 4
@@ -285,6 +285,31 @@ _SWEEP = """
     auto widen = [](V values) -> P { return __builtin_convertvector(values, P); };
 """
 
+# Caches hold no such bed from step to step: what the next block reads is fetched while this one is
+# computed, a line of zeros instead of loads that are not there.
+_FETCH = """
+    if (node_count > LARGE && block + 1 < block_count) {
+        const int* others = block_fiber + W * (block + 1);
+        const long from = fiber_node_start[others[0]];
+        const long to = fiber_node_start[others[block_own[block + 1] - 1] + 1];
+        auto fetch = [&](const void* start, long bytes) {
+            const char* const from_byte = (const char*)start;
+            for (long at = 0; at < bytes; at += 64) __builtin_prefetch(from_byte + at, 0, 2);
+        };
+        if (to - from <= W * nodes) {
+            fetch((const double*)place + 3 * from, 3 * sizeof(double) * (to - from));
+            fetch((const T*)node_velocity + 3 * from, 3 * sizeof(T) * (to - from));
+            fetch((const T*)node_spin + 3 * from, 3 * sizeof(T) * (to - from));
+            if (loads)
+                for (int p = 0; p < PARTS; ++p)
+                    for (long node = from; node < to; ++node) {
+                        const long line = 1 + node + (long)node_count * p;
+                        __builtin_prefetch(load_lines + line * contact_touch[line - 1], 0, 2);
+                    }
+        }
+    }
+"""
+
 _LOAD = """
     load_P(3, x, (const double*)place);
     load_V(3, v, (const T*)node_velocity);
@@ -303,7 +328,8 @@ _LOAD = """
 def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> str:
     """Body of a function with the arguments of the sweep, `arrays` those that are arrays."""
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
-    work = _LOAD.replace("GATHER", _GATHER.replace("TRANSPOSE", transpose(LANES))).replace(
+    work = _FETCH.replace("LARGE", str(LARGE))
+    work += _LOAD.replace("GATHER", _GATHER.replace("TRANSPOSE", transpose(LANES))).replace(
         "BONDS", BONDS + _RATES
     )
     work += _MOVE.replace("HOLD", _HOLD) + _STORE
@@ -312,7 +338,7 @@ def bond_sweep_source(name: str, features: BondFeatures, arrays: list[str]) -> s
     if name == "float32":
         places = transfers("P", LANES)
     return f"""
-    const int node_count = place.shape[0];
+    const int node_count = place.shape[0], block_count = block_own.shape[0];
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {types}

@@ -17,6 +17,7 @@ from warpfiber.laws.capsule_contact import (
     SLENDER,
     SMALLEST_SINE,
 )
+from warpfiber.passes.capsule_touch import LEAST_PART
 from warpfiber.passes.pairs import END_TOLERANCE
 
 # Terms of log((1 + f) / (1 - f)) up to f = 3 - sqrt(8), and of exp up to half a binary digit.
@@ -33,7 +34,9 @@ def contact_constants(name: str) -> str:
         "ALIGNED": ALIGNED,
         "SLENDER": SLENDER,
         "POWER": POWER,
+        "STEEP": 1.5 * SLENDER * POWER,
         "NEAR": END_TOLERANCE[name],
+        "LEAST_PART": LEAST_PART,
         "TINY": 1e-30,
         "FAR": 1e30,
         "LN2": math.log(2.0),
@@ -88,17 +91,20 @@ POWERS = """
         const M twos = (__builtin_convertvector(n, M) + BIAS) << DIGITS;
         return value * __builtin_bit_cast(V, twos);
     };
-    // sqrt(R*) F_2^-1.5 of the sum and the product of the curvatures
-    auto hertz_factor = [&](V sum, V product) -> V {
+    // sqrt(R*) F_2^-1.5 of the sum and the product of the curvatures, and its d ln / d ln product
+    auto hertz_factor = [&](V sum, V product, V& steepness) -> V {
         const V difference = root(larger(sum * sum - T(4) * product, V(T(0))));
         const V ratio = (sum + difference) * (sum + difference) / (T(4) * product);
         const V slope = larger(power(ratio, SLENDER) - T(1), V(T(1e-15)));
-        const V correction = T(1) - power(slope, POWER);
+        const V lacking = power(slope, POWER), correction = T(1) - lacking;
+        const V steep = STEEP * lacking * (T(1) + slope) * sum / (slope * correction * difference);
+        steepness = (difference > T(0) ? -steep : V(T(0))) - T(0.25);
         return T(1) / (root(root(product)) * correction * root(correction));
     };
 """
 
-# Sets force, stiffness, s, t and depth of the lanes; no force where another pair has the contact.
+# Sets force, stiffness, s, t and depth of the lanes; no force where another pair has the contact;
+# loads of nodes on top of that force where lanes are `saddled`.
 # Without HAS_LINE for pairs none of which can be a line.
 NORMAL = """
     const V reach = radius_i + radius_j;
@@ -117,7 +123,8 @@ NORMAL = """
     M is_line = V(T(1)) < T(0);
     if constexpr (HAS_LINE) is_line = hit & (cosine > LINE_COSINE);
     if (HAS_LINE && any(is_line)) {
-        factor = hertz_factor(ki + kj, ki * kj * sine * sine);
+        V steepness;
+        factor = hertz_factor(ki + kj, ki * kj * sine * sine, steepness);
         const V3 along = b * (ab < T(0) ? V(T(-1)) : V(T(1)));
         V3 middle = a * (T(1) / la) + along * (T(1) / lb);
         middle = middle * (T(1) / root(middle.dot(middle)));
@@ -175,40 +182,120 @@ NORMAL = """
     M reject = (high_i & ~tip1_i) | (high_j & ~tip1_j) | (is_line & ~(end_i | end_j)) | ~hit;
     reject |= low_i & ~tip0_i & (c0.dot(back_i) < -NEAR * back_i.dot(back_i));
     reject |= low_j & ~tip0_j & (c0.dot(back_j) > NEAR * back_j.dot(back_j));
-    if (any(~reject)) {
+    // saddles and maxima of the distance between lanes' segments, beside a minimum or without one
+    const V deep = larger(reach - root(square0), V(T(0))), deep_root = root(deep);
+    const V all = deep * deep_root, patch = root(T(2) * reach * deep) / sine;
+    V less = V(T(0)), less_root = V(T(0)), stored = V(T(0));
+    V3 beside_i0 = nothing3, beside_i1 = nothing3, beside_j0 = nothing3, beside_j1 = nothing3;
+    const V far_i = s * la, far_j = t * lb;
+    const M bends = hit & ~is_line;
+    const M at0_i = bends & ~tip0_i & (far_i < patch);
+    const M at1_i = bends & ~tip1_i & (la - far_i < patch);
+    const M at0_j = bends & ~tip0_j & (far_j < patch);
+    const M at1_j = bends & ~tip1_j & (lb - far_j < patch);
+    auto nears = [&](const V3& away, const V3& edge) -> M {
+        return away.dot(edge) > NEAR * edge.dot(edge);
+    };
+    auto saddle = [&](M near, const V3& vertex, const V3& inward, const V3& onward, const V3& from,
+                      const V3& other, V length2, const V3& behind, const M& tip0, const M& tip1,
+                      V3& on_vertex, V3& on_start, V3& on_end) {
+        if (!any(near)) return;
+        const V part = clamp01((vertex - from).dot(other) / length2);
+        const V3 away = from + other * part - vertex;
+        const V square = away.dot(away);
+        near &= (square < reach * reach) & nears(away, inward) & nears(away, onward);
+        near &= (part < T(1) - NEAR) | tip1;
+        near &= (part > NEAR) | tip0 | ~nears(nothing3 - away, behind);
+        if (!any(near)) return;
+        const V far = root(square), below = larger(reach - far, V(T(0)));
+        const V root_there = near ? T(0.5) * root(below) : V(T(0)), pull = below * root_there;
+        less_root += root_there;
+        less += pull;
+        stored -= below * pull;
+        const V3 on = away * (pull / far);
+        on_vertex = on_vertex + on;
+        on_start = on_start - on * (T(1) - part);
+        on_end = on_end - on * part;
+    };
+    auto summit = [&](M near, const V3& gap, const V3& inward_i, const V3& onward_i,
+                      const V3& inward_j, const V3& onward_j, V3& on_i, V3& on_j) {
+        if (!any(near)) return;
+        const V square = gap.dot(gap);
+        const V3 back = nothing3 - gap;
+        near &= (square < reach * reach) & nears(gap, inward_i) & nears(gap, onward_i);
+        near &= nears(back, inward_j) & nears(back, onward_j);
+        if (!any(near)) return;
+        const V far = root(square), below = larger(reach - far, V(T(0)));
+        const V root_there = near ? T(0.25) * root(below) : V(T(0)), push = below * root_there;
+        less_root -= root_there;
+        less -= push;
+        stored += below * push;
+        const V3 on = gap * (push / far);
+        on_i = on_i - on;
+        on_j = on_j + on;
+    };
+    if (any(at0_i | at1_i | at0_j | at1_j)) {
+        const V3 onto_i = nothing3 - back_i, onto_j = nothing3 - back_j;
+        const V3 from_i = nothing3 - a, from_j = nothing3 - b, end_j = delta + b;
+        saddle(at0_i, nothing3, a, onto_i, delta, b, bb, onto_j, tip0_j, tip1_j,
+               beside_i0, beside_j0, beside_j1);
+        saddle(at1_i, a, from_i, ahead_i, delta, b, bb, onto_j, tip0_j, tip1_j,
+               beside_i1, beside_j0, beside_j1);
+        saddle(at0_j, delta, b, onto_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
+               beside_j0, beside_i0, beside_i1);
+        saddle(at1_j, end_j, from_j, ahead_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
+               beside_j1, beside_i0, beside_i1);
+        summit(at0_i & at0_j, delta, a, onto_i, b, onto_j, beside_i0, beside_j0);
+        summit(at0_i & at1_j, end_j, a, onto_i, from_j, ahead_j, beside_i0, beside_j1);
+        summit(at1_i & at0_j, delta - a, from_i, ahead_i, b, onto_j, beside_i1, beside_j0);
+        summit(at1_i & at1_j, end_j - a, from_i, ahead_i, from_j, ahead_j, beside_i1, beside_j1);
+    }
+    M saddled = less > T(0);
+    if (any(~reject | saddled)) {
         const V total = ki + kj;
         V sum = end_i ? ki + total : total, product = end_i ? ki * total : ki * kj * sine * sine;
         sum = end_j ? kj + total : sum;
         product = end_j ? kj * total : product;
         sum = (end_i & end_j) ? T(2) * total : sum;
         product = (end_i & end_j) ? total * total : product;
-        factor = hertz_factor(sum, product);
-        const V deep = larger(reach - root(square0), V(T(0)));
-        const V patch = root(T(2) * reach * deep) / sine, inverse = T(1) / patch;
-        // a part where the fiber comes nearer again beyond a node: 0 at the node, 1 at its start
-        auto share = [&](V far, const M& tip, const V3& vertex, const V3& from, const V3& other,
-                         V length2, const V3& onward) {
-            const M near = ~tip & (far < patch);
-            if (!any(near)) return;
-            const V part = clamp01((vertex - from).dot(other) / length2);
-            const V3 away = from + other * part - vertex;
-            const M hollow = near & (away.dot(onward) > NEAR * onward.dot(onward));
-            factor = hollow ? factor * (T(0.5) + T(0.5) * far * inverse) : factor;
-        };
-        const V3 nothing = same3(0, 0, 0);
-        share(s * la, tip0_i, nothing, delta, b, bb, nothing - back_i);
-        share((T(1) - s) * la, tip1_i, a, delta, b, bb, ahead_i);
-        share(t * lb, tip0_j, delta, nothing, a, aa, nothing - back_j);
-        share((T(1) - t) * lb, tip1_j, delta + b, nothing, a, aa, ahead_j);
-        const V k = T(2) * modulus * factor * root(deep);
-        const V push = T(2.0 / 3.0) * k * deep;
-        const M point = ~reject & ~(force >= push);
-        force = point ? push : force;
-        stiffness = point ? k : stiffness;
+        V steepness;
+        factor = hertz_factor(sum, product, steepness);
+        const V k = T(2) * modulus * factor, scale = T(2.0 / 3.0) * k;
+        const M point = ~reject & ~(force >= scale * all);
+        saddled = (saddled & (point | reject)) | point;
+        const V net = larger(all - less, LEAST_PART * all);
+        // of the whole minimum, this is not in the force at s and t
+        const V3 rest = c0 * (point ? (all - net) / root(square0) : V(T(0)));
+        beside_i0 = (beside_i0 - rest * (T(1) - s)) * scale;
+        beside_i1 = (beside_i1 - rest * s) * scale;
+        beside_j0 = (beside_j0 + rest * (T(1) - t)) * scale;
+        beside_j1 = (beside_j1 + rest * t) * scale;
+        // a wider angle stores less: d ln P = -2 cos d cos / sin^2
+        stored += point ? deep * all : V(T(0));
+        const V cosine1 = ab * both;
+        V twist = T(0.8) * scale * stored * steepness * cosine1 / (sine * sine);
+        twist = (end_i | end_j | (sine <= SMALLEST_SINE)) ? V(T(0)) : twist;
+        const V3 along_a = a * (T(1) / la), along_b = b * (T(1) / lb);
+        const V3 on_i = (along_b - along_a * cosine1) * (twist / la);
+        const V3 on_j = (along_a - along_b * cosine1) * (twist / lb);
+        beside_i0 = beside_i0 - on_i;
+        beside_i1 = beside_i1 + on_i;
+        beside_j0 = beside_j0 - on_j;
+        beside_j1 = beside_j1 + on_j;
+        force = point ? scale * net : force;
+        stiffness = point ? k * larger(deep_root - less_root, LEAST_PART * deep_root) : stiffness;
         depth = point ? deep : depth;
         line_s = point ? s : line_s;
         line_t = point ? t : line_t;
     }
+    auto of_saddled = [&](V3& load) {
+        load = V3{saddled ? load.x : V(T(0)), saddled ? load.y : V(T(0)),
+                  saddled ? load.z : V(T(0))};
+    };
+    of_saddled(beside_i0);
+    of_saddled(beside_i1);
+    of_saddled(beside_j0);
+    of_saddled(beside_j1);
     s = line_s;
     t = line_t;
 """

@@ -18,6 +18,9 @@ from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_
 LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
+LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
+AHEAD = 4  # blocks of pairs whose nodes are fetched then, else one
+READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
 
@@ -33,6 +36,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
     numbers = {
         "PARTS": PARTS,
         "TIP_BITS": TIP_BITS,
+        "AHEAD": AHEAD,
         "SLOT_HALT": HALT,
     }
     numbers |= image_constants()
@@ -122,7 +126,8 @@ _LAW = """
         NORMAL
         const M acts = force > T(0);
         const unsigned mine = bits(acts) & ((1u << count) - 1u);
-        if (mine == 0) return;
+        const unsigned loaded = bits(acts | saddled) & ((1u << count) - 1u);
+        if (loaded == 0) return;
 
         const V3 c = delta + b * t - a * s;
         const V distance = root(c.dot(c));
@@ -205,17 +210,19 @@ _LAW = """
         }
         const V3 whole = drag - n * size;
         const V3 moment = n.cross(whole);
-        V numbers[8] = {
-            whole.x, whole.y, whole.z, moment.x * arm_i, moment.y * arm_i, moment.z * arm_i};
-        numbers[6] = numbers[7] = V(T(0));
-        T8 on_i[W], on_j[W];
-        turn_back(numbers, on_i);
-        for (int c = 0; c < 3; ++c) numbers[c] = -numbers[c];
-        numbers[3] = moment.x * arm_j;
-        numbers[4] = moment.y * arm_j;
-        numbers[5] = moment.z * arm_j;
-        turn_back(numbers, on_j);
-        for (unsigned left = mine; left != 0; left &= left - 1) {
+        T8 rows[4][W];
+        auto load_row = [&](int m, const V3& force_there, V part) {
+            const V lever = part * (m < 2 ? arm_i : arm_j);
+            V numbers[8] = {force_there.x, force_there.y, force_there.z,
+                            moment.x * lever, moment.y * lever, moment.z * lever};
+            numbers[6] = numbers[7] = V(T(0));
+            turn_back(numbers, rows[m]);
+        };
+        load_row(0, beside_i0 + whole * (T(1) - s), T(1) - s);
+        load_row(1, beside_i1 + whole * s, s);
+        load_row(2, beside_j0 - whole * (T(1) - t), T(1) - t);
+        load_row(3, beside_j1 - whole * t, t);
+        for (unsigned left = loaded; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             auto add = [&](int node, T8 values) {
                 // the line of a node without loads yet is not the first one, which is of zeros
@@ -223,11 +230,11 @@ _LAW = """
                 *line = load_lines[(part_line + node) * touch[node]] + values;
                 touch[node] = 1;
             };
-            const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
-            add(node_i[l], on_i[l] * (T(1) - s_l));
-            add(node_i[l] + 1, on_i[l] * s_l);
-            add(node_j[l], on_j[l] * (T(1) - t_l));
-            add(node_j[l] + 1, on_j[l] * t_l);
+            add(node_i[l], rows[0][l]);
+            add(node_i[l] + 1, rows[1][l]);
+            add(node_j[l], rows[2][l]);
+            add(node_j[l] + 1, rows[3][l]);
+            if (!(mine >> l & 1)) continue;
             const long k = ks[l];
             if constexpr (HAS_FRICTION) {
                 for (int p = 0; p < 4; ++p) kept_now[4 * k + p] = h_out[p][l];
@@ -243,8 +250,8 @@ _LAW = """
                     f[c] = ((const T*)(&whole.x + c))[l];
                     m[c] = ((const T*)(&moment.x + c))[l];
                 }
-                arms[0] = s_l;
-                arms[1] = t_l;
+                arms[0] = ((const T*)&s)[l];
+                arms[1] = ((const T*)&t)[l];
                 arms[2] = ((const T*)&arm_i)[l];
                 arms[3] = ((const T*)&arm_j)[l];
             }
@@ -286,15 +293,16 @@ _SWEEP = """
         __builtin_memcpy(&code_j, near_j + first, sizeof(I));
         __builtin_memcpy(&images, near_image + first, sizeof(I));
         const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
-        for (int l = 0; l < W; ++l)
-            __builtin_prefetch((const double*)place + 3L * (near_j[first + W + l] >> TIP_BITS));
+        const int* const later = near_j + first + (is_large ? AHEAD : 1) * W;
+        for (int l = 0; l < W; ++l) {
+            const double* const x = (const double*)place + 3L * (later[l] >> TIP_BITS);
+            __builtin_prefetch(x);
+            if (is_large) __builtin_prefetch(x + 5);
+        }
         V s, t;
         M aligned;
         const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aligned);
-        // at the far end of a segment that has a next one, that one has the contact
-        M next = (s >= T(1) - NEAR) & ~tipped(code_i, 2);
-        next |= (t >= T(1) - NEAR) & ~tipped(code_j, 2);
-        const M hit = (c.dot(c) < largest_reach * largest_reach) & (aligned | ~next);
+        const M hit = c.dot(c) < largest_reach * largest_reach;
         const unsigned line = bits(aligned);
         for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
@@ -313,6 +321,8 @@ _SWEEP = """
             __builtin_prefetch(load + j, 1);
             __builtin_prefetch(load + j + 1, 1);
             if constexpr (HAS_FRICTION) {
+                __builtin_prefetch(written_last + k);
+                __builtin_prefetch(written_now + k, 1);
                 __builtin_prefetch(kept_last + 4 * k);
                 __builtin_prefetch(kept_now + 4 * k, 1);
             }
@@ -331,7 +341,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
     const int kept_size = pair_step.shape[1], node_count = place.shape[0];
-    const bool one_group = groups.shape[0] == 1;
+    const bool one_group = groups.shape[0] == 1, is_large = node_count > {LARGE};
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}

@@ -14,7 +14,7 @@ Source: projected Gauss-Seidel, over-relaxed, in the order of the queue: the dua
         f <- max(0, f - OVER e/(D + C)),  D exact
         e = b + n.(z_j(t) - z_i(s)),  z(s) = (1 - s) z_k + s z_k+1
     Rows of compliance C (lubrication) as in `dual_rows`; the exponential law, whose compliance
-    changes with f, takes the largest.
+    changes with f, takes the largest. Friction: `native_friction`.
 Symbols: e balance of a row, a length; z motion of node k by all forces, four numbers (the last one
     the impulse of the segment before it); `low` the largest e of either sign for which nobody is
     visited again, SHARE of the tolerance; in the first look at all rows, which costs little, only

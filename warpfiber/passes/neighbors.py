@@ -92,9 +92,7 @@ class NeighborList:
         closed = len(model.segment_end) > 0
         self.native = model.device.startswith("cpu") if native is None else native
         self.native = self.native and not closed  # vectors know open fibers alone
-        room = 1.5  # pairs per segment; a wide list has more
-        if flow_origin is not None:
-            room = 3.0 if self.native else 2.4
+        room = 1.5 if flow_origin is None else 3.2  # pairs per segment; a wide list has more
         self.pair_capacity = pair_capacity or max(64, int(room * model.segment_count))
         self.build_count = 0
         self.grow_count = 0

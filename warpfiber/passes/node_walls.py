@@ -95,7 +95,8 @@ def make_node_walls(
         depth = g.radius - gap
         if depth <= zero:
             if wp.static(has_friction):
-                if depths[slot] != zero:
+                # no step takes a node a radius away: the memories of most are not even read
+                if depth > -g.radius and depths[slot] != zero:
                     depths[slot] = zero
             return force, moment, zero
         k = plane_stiffness(g.wall_modulus, curvature_radius, depth)

@@ -118,15 +118,14 @@ def make_row_slip(name: str, periodic: bool, has_frozen: bool, module: str = "un
         wall = key / 2
         if key >= wp.static(ARRAY_KEY):
             wall = (key - wp.static(ARRAY_KEY)) / 8
-        axis = wall / 2
-        x = touched
-        x[axis] = low[axis]
+        across = vec3(real(wall / 2 == 0), real(wall / 2 == 1), real(wall / 2 == 2))
+        face = low
         if wall % 2 == 1:
-            x[axis] = high[axis]
+            face = high
+        x = touched + wp.dot(across, face - touched) * across
         u = flow_velocity(stage_gradient[0], flow_origin, x)
         u += flow_velocity(stage_gradient[1], flow_origin, x)
-        u[axis] = zero
-        return (half * dt) * u
+        return (half * dt) * (u - wp.dot(across, u) * across)
 
     @wp.kernel(**options)
     def fill_slip(

@@ -54,7 +54,7 @@ def check_arrays(draft: Draft) -> None:
             remedy = f"not available in method {draft.method}; use overdamped or rigid_rod"
             draft.blame(f"{path}.kind", remedy)
         if wall["friction"]:
-            draft.blame(f"{path}.friction", "remove it; arrays are frictionless")
+            draft.blame(f"{path}.friction", "remove it; arrays have contact.wall_friction")
         if isinstance(wall["velocity"], tuple):
             remedy = 'an array goes with the flow along its fibers; use velocity = "flow"'
             draft.blame(f"{path}.velocity", remedy)
