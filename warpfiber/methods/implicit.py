@@ -63,6 +63,7 @@ class Implicit(Method):
         self.ends_lattice = wp.zeros(2, dtype=p.mat33, device=device)
         self.deformation_next = wp.zeros(1, dtype=wp.mat33d, device=device)
         self.verdict = wp.zeros(2, dtype=wp.int32, device=device)
+        self.pace = wp.zeros(1, dtype=wp.float64, device=device)
         self.rejected = wp.zeros(2, dtype=wp.int32, device=device)  # the last step, and in all
         self.fiber_error = wp.zeros(model.fiber_count, dtype=p.real, device=device)
         chunks = min(ERROR_CHUNKS, model.fiber_count) if self.adaptive else 0
@@ -109,6 +110,7 @@ class Implicit(Method):
                 self.rejected,
                 self.verdict,
                 self.stage_gradient,
+                self.pace,
             ),
             flow_origin=self.flow_origin,
             stretch=float(self._segment_stretch().max()),
@@ -200,6 +202,7 @@ class Implicit(Method):
             self.error,
             self.error_fiber,
             self.verdict,
+            self.pace,
             self.strain_next,
             self.step_size,
             self.rejected,

@@ -1,8 +1,8 @@
 """Begin and end of an implicit step: the flow at its stages, acceptance, time, size of the next.
 
 A step that fails (error above the tolerance, contact that was not kept apart) is taken back and
-repeated by half; one that the neighbor list or the rows of contact cannot hold is taken back as it
-is, and the host enlarges them.
+repeated by a smaller one, of contact as `contact_verdict` says; one that the neighbor list or the
+rows of contact cannot hold is taken back as it is, and the host enlarges them.
 
 Source: stage strains by the midpoint rule of d(strain)/dt = rate f(strain); the lattice follows the
     gradient of the middle of the step. Step sizes: accept an error up to 1.5 tolerances, then dt
@@ -118,8 +118,8 @@ def make_step_end(
 ):
     """Kernel `step_end` (one thread): accept or not, advance the time, choose the next step.
 
-    `judged`: a verdict on the contacts of the step may ask for half of it (1) or for the same again
-    after the host has enlarged something (2).
+    `judged`: a verdict on the contacts of the step may ask for less of it (1) or for the same again
+    after the host has enlarged something (2); `pace` is the next step over this one.
     """
     mat33 = precision(name).mat33
     rate_factor, lattice_push = make_flow_history()
@@ -133,6 +133,7 @@ def make_step_end(
         error: wp.array(dtype=wp.float64),
         error_fiber: wp.array(dtype=wp.int32),
         verdict: wp.array(dtype=wp.int32),
+        pace: wp.array(dtype=wp.float64),
         strain_next: wp.array(dtype=wp.float64),
         step_size: wp.array(dtype=wp.float64),
         rejected_out: wp.array(dtype=wp.int32),
@@ -155,12 +156,12 @@ def make_step_end(
                     status[wp.static(EXPIRED)] = 1
                     return
                 rejected_out[1] = rejected_out[1] + 1
-                step_size[0] = wp.float64(0.5) * dt
+                step_size[0] = pace[0] * dt
                 if step_size[0] < wp.float64(wp.static(SMALLEST_SHARE)) * largest_step:
                     status[wp.static(TORN)] = 1
                     status[wp.static(BAD_FIBER)] = verdict[1]
                 return
-            step_size[0] = wp.min(wp.float64(2.0) * dt, largest_step)
+            step_size[0] = wp.min(pace[0] * dt, largest_step)
         if wp.static(adaptive):
             largest = wp.float64(0.0)
             worst = wp.int32(0)
