@@ -153,11 +153,13 @@ def dragged(first: int, velocity: list[float], friction: float) -> Simulation:
 
 
 def pushes(sim: Simulation) -> np.ndarray:
-    """Sum over the contacts of all listed pairs, in run units."""
+    """Sum over the contacts of all listed pairs and what hollows take off them, in run units."""
     contacts = sim.method.contacts  # type: ignore[attr-defined]
     count = sim.method.list.pair_count  # type: ignore[union-attr]
     acts = contacts.acts.numpy()[:count] != 0
+    bends = contacts.bends.numpy()[:count] != 0
     total: np.ndarray = contacts.force.numpy()[:count][acts].sum(axis=0)
+    total += contacts.beside.numpy()[:count][bends][:, :2].sum(axis=(0, 1))
     return total
 
 

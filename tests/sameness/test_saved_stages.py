@@ -66,8 +66,8 @@ speed = 0.2
 end_pressure = 300
 [[stage]]
 kind = "pull"
-freeze_below = 0.004
-freeze_above = 0.007
+freeze_below = 0.003
+freeze_above = 0.005
 speed = 0.2
 end_strain = 0.5
 save = true

@@ -47,11 +47,11 @@ def cell(
 
 
 def work(sim: Simulation) -> Any:
-    """What the relaxation of the last step worked with."""
+    """What the first relaxation of the last step worked with."""
     assert sim.method.executor is not None
-    launches = {launch.name: launch for launch in sim.method.executor.launches}
-    assert launches["relax_parts"].inputs[0] == PARTS
-    return launches["relax_parts"].inputs[1]
+    launches = [step for step in sim.method.executor.launches if step.name == "relax_parts"]
+    assert launches[0].inputs[0] == PARTS
+    return launches[0].inputs[1]
 
 
 def nodes(sim: Simulation) -> Array:
