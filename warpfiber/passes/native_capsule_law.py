@@ -37,6 +37,7 @@ def contact_constants(name: str) -> str:
         "STEEP": 1.5 * SLENDER * POWER,
         "NEAR": END_TOLERANCE[name],
         "LEAST_PART": LEAST_PART,
+        "ROUNDED": 2.0 * (1.0 + 1e-5),
         "TINY": 1e-30,
         "FAR": 1e30,
         "LN2": math.log(2.0),
@@ -236,19 +237,36 @@ NORMAL = """
     };
     if (any(at0_i | at1_i | at0_j | at1_j)) {
         const V3 onto_i = nothing3 - back_i, onto_j = nothing3 - back_j;
+        // where the distance falls beyond a node: most nodes are out here, without their distances
+        const V da = delta.dot(a), db = delta.dot(b), both2 = both * both;
+        const V in_aa = bb * both2, in_bb = aa * both2;
+        const V b_onto = b.dot(onto_i), b_ahead = b.dot(ahead_i);
+        const V a_onto = a.dot(onto_j), a_ahead = a.dot(ahead_j);
+        const V i00 = delta.dot(onto_i), i01 = i00 + b_onto;
+        const V i10 = (delta - a).dot(ahead_i), i11 = i10 + b_ahead;
+        const V j00 = delta.dot(onto_j), j10 = j00 - a_onto;
+        const V j01 = (delta + b).dot(ahead_j), j11 = j01 - a_ahead;
+        const M down0_i = i00 + clamp01(-db * in_bb) * b_onto > T(0);
+        const M down1_i = i10 + clamp01((ab - db) * in_bb) * b_ahead > T(0);
+        const M down0_j = j00 - clamp01(da * in_aa) * a_onto < T(0);
+        const M down1_j = j01 - clamp01((da + ab) * in_aa) * a_ahead < T(0);
+        const M down00 = (da > T(0)) & (db < T(0)) & (i00 > T(0)) & (j00 < T(0));
+        const M down01 = (da > -ab) & (db > -bb) & (i01 > T(0)) & (j01 < T(0));
+        const M down10 = (da < aa) & (db < ab) & (i10 > T(0)) & (j10 < T(0));
+        const M down11 = (da < aa - ab) & (db > ab - bb) & (i11 > T(0)) & (j11 < T(0));
         const V3 from_i = nothing3 - a, from_j = nothing3 - b, end_j = delta + b;
-        saddle(at0_i, nothing3, a, onto_i, delta, b, bb, onto_j, tip0_j, tip1_j,
+        saddle(at0_i & ~low_i & down0_i, nothing3, a, onto_i, delta, b, bb, onto_j, tip0_j, tip1_j,
                beside_i0, beside_j0, beside_j1);
-        saddle(at1_i, a, from_i, ahead_i, delta, b, bb, onto_j, tip0_j, tip1_j,
+        saddle(at1_i & ~high_i & down1_i, a, from_i, ahead_i, delta, b, bb, onto_j, tip0_j, tip1_j,
                beside_i1, beside_j0, beside_j1);
-        saddle(at0_j, delta, b, onto_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
+        saddle(at0_j & ~low_j & down0_j, delta, b, onto_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
                beside_j0, beside_i0, beside_i1);
-        saddle(at1_j, end_j, from_j, ahead_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
+        saddle(at1_j & ~high_j & down1_j, end_j, from_j, ahead_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
                beside_j1, beside_i0, beside_i1);
-        summit(at0_i & at0_j, delta, a, onto_i, b, onto_j, beside_i0, beside_j0);
-        summit(at0_i & at1_j, end_j, a, onto_i, from_j, ahead_j, beside_i0, beside_j1);
-        summit(at1_i & at0_j, delta - a, from_i, ahead_i, b, onto_j, beside_i1, beside_j0);
-        summit(at1_i & at1_j, end_j - a, from_i, ahead_i, from_j, ahead_j, beside_i1, beside_j1);
+        summit(at0_i & at0_j & down00, delta, a, onto_i, b, onto_j, beside_i0, beside_j0);
+        summit(at0_i & at1_j & down01, end_j, a, onto_i, from_j, ahead_j, beside_i0, beside_j1);
+        summit(at1_i & at0_j & down10, delta - a, from_i, ahead_i, b, onto_j, beside_i1, beside_j0);
+        summit(at1_i & at1_j & down11, end_j - a, from_i, ahead_i, from_j, ahead_j, beside_i1, beside_j1);
     }
     M saddled = less > T(0);
     if (any(~reject | saddled)) {
