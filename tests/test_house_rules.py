@@ -277,6 +277,12 @@ def _texts() -> list[Path]:
     return sorted(p for p in found if p.suffix in TEXT_SUFFIXES and not skipped & set(p.parts))
 
 
+def test_names_of_test_files_are_unique() -> None:
+    """Files of tests are modules without a package: two of a name are not collected together."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) > 100 and len(names) == len(set(names))
+
+
 def test_no_words_of_the_workplace() -> None:
     wrong = []
     for path in _texts():
