@@ -37,6 +37,7 @@ def contact_constants(name: str) -> str:
         "STEEP": 1.5 * SLENDER * POWER,
         "NEAR": END_TOLERANCE[name],
         "LEAST_PART": LEAST_PART,
+        "ROUNDED": 2.0 * (1.0 + 1e-5),
         "TINY": 1e-30,
         "FAR": 1e30,
         "LN2": math.log(2.0),
@@ -193,62 +194,124 @@ NORMAL = """
     const M at1_i = bends & ~tip1_i & (la - far_i < patch);
     const M at0_j = bends & ~tip0_j & (far_j < patch);
     const M at1_j = bends & ~tip1_j & (lb - far_j < patch);
-    auto nears = [&](const V3& away, const V3& edge) -> M {
-        return away.dot(edge) > NEAR * edge.dot(edge);
+    // one lane at a time: they are few
+    struct One {
+        T x, y, z;
+        One operator+(const One& b) const { return {x + b.x, y + b.y, z + b.z}; }
+        One operator-(const One& b) const { return {x - b.x, y - b.y, z - b.z}; }
+        One operator-() const { return {-x, -y, -z}; }
+        One operator*(T s) const { return {x * s, y * s, z * s}; }
+        T dot(const One& b) const { return x * b.x + y * b.y + z * b.z; }
+        bool nears(const One& edge) const { return dot(edge) > NEAR * edge.dot(edge); }
     };
-    auto saddle = [&](M near, const V3& vertex, const V3& inward, const V3& onward, const V3& from,
-                      const V3& other, V length2, const V3& behind, const M& tip0, const M& tip1,
+    auto one_of = [](const V& v, int l) -> T { return ((const T*)&v)[l]; };
+    auto at_lane = [](const V3& v, int l) -> One {
+        return {((const T*)&v.x)[l], ((const T*)&v.y)[l], ((const T*)&v.z)[l]};
+    };
+    auto add_lane = [](V& v, int l, T more) { ((T*)&v)[l] += more; };
+    auto add3 = [](V3& v, int l, const One& more) {
+        ((T*)&v.x)[l] += more.x;
+        ((T*)&v.y)[l] += more.y;
+        ((T*)&v.z)[l] += more.z;
+    };
+    auto count_depth = [&](int l, T sign, T below, T root_there) {
+        const T pull = below * root_there;
+        add_lane(less_root, l, sign * root_there);
+        add_lane(less, l, sign * pull);
+        add_lane(stored, l, -sign * below * pull);
+        return pull;
+    };
+    auto saddle = [&](int l, const One& vertex, const One& inward, const One& onward,
+                      const One& from, const One& other, const One& behind, bool tip0, bool tip1,
                       V3& on_vertex, V3& on_start, V3& on_end) {
-        if (!any(near)) return;
-        const V part = clamp01((vertex - from).dot(other) / length2);
-        const V3 away = from + other * part - vertex;
-        const V square = away.dot(away);
-        near &= (square < reach * reach) & nears(away, inward) & nears(away, onward);
-        near &= (part < T(1) - NEAR) | tip1;
-        near &= (part > NEAR) | tip0 | ~nears(nothing3 - away, behind);
-        if (!any(near)) return;
-        const V far = root(square), below = larger(reach - far, V(T(0)));
-        const V root_there = near ? T(0.5) * root(below) : V(T(0)), pull = below * root_there;
-        less_root += root_there;
-        less += pull;
-        stored -= below * pull;
-        const V3 on = away * (pull / far);
-        on_vertex = on_vertex + on;
-        on_start = on_start - on * (T(1) - part);
-        on_end = on_end - on * part;
+        T part = (vertex - from).dot(other) / other.dot(other);
+        part = part > T(0) ? part : T(0);
+        part = part < T(1) ? part : T(1);
+        const One away = from + other * part - vertex;
+        const T square = away.dot(away), span = one_of(reach, l);
+        if (square >= span * span || !away.nears(inward) || !away.nears(onward)) return;
+        if (part >= T(1) - NEAR && !tip1) return;
+        if (part <= NEAR && !tip0 && (-away).nears(behind)) return;
+        const T far = __builtin_elementwise_sqrt(square), below = span > far ? span - far : T(0);
+        const T pull = count_depth(l, T(1), below, T(0.5) * __builtin_elementwise_sqrt(below));
+        const One on = away * (pull / far);
+        add3(on_vertex, l, on);
+        add3(on_start, l, on * (part - T(1)));
+        add3(on_end, l, on * -part);
     };
-    auto summit = [&](M near, const V3& gap, const V3& inward_i, const V3& onward_i,
-                      const V3& inward_j, const V3& onward_j, V3& on_i, V3& on_j) {
-        if (!any(near)) return;
-        const V square = gap.dot(gap);
-        const V3 back = nothing3 - gap;
-        near &= (square < reach * reach) & nears(gap, inward_i) & nears(gap, onward_i);
-        near &= nears(back, inward_j) & nears(back, onward_j);
-        if (!any(near)) return;
-        const V far = root(square), below = larger(reach - far, V(T(0)));
-        const V root_there = near ? T(0.25) * root(below) : V(T(0)), push = below * root_there;
-        less_root -= root_there;
-        less -= push;
-        stored += below * push;
-        const V3 on = gap * (push / far);
-        on_i = on_i - on;
-        on_j = on_j + on;
+    auto summit = [&](int l, const One& gap, const One& inward_i, const One& onward_i,
+                      const One& inward_j, const One& onward_j, V3& on_i, V3& on_j) {
+        const T square = gap.dot(gap), span = one_of(reach, l);
+        const One back = -gap;
+        if (square >= span * span || !gap.nears(inward_i) || !gap.nears(onward_i)) return;
+        if (!back.nears(inward_j) || !back.nears(onward_j)) return;
+        const T far = __builtin_elementwise_sqrt(square), below = span > far ? span - far : T(0);
+        const T push = count_depth(l, T(-1), below, T(0.25) * __builtin_elementwise_sqrt(below));
+        const One on = gap * (push / far);
+        add3(on_i, l, -on);
+        add3(on_j, l, on);
     };
     if (any(at0_i | at1_i | at0_j | at1_j)) {
         const V3 onto_i = nothing3 - back_i, onto_j = nothing3 - back_j;
-        const V3 from_i = nothing3 - a, from_j = nothing3 - b, end_j = delta + b;
-        saddle(at0_i, nothing3, a, onto_i, delta, b, bb, onto_j, tip0_j, tip1_j,
-               beside_i0, beside_j0, beside_j1);
-        saddle(at1_i, a, from_i, ahead_i, delta, b, bb, onto_j, tip0_j, tip1_j,
-               beside_i1, beside_j0, beside_j1);
-        saddle(at0_j, delta, b, onto_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
-               beside_j0, beside_i0, beside_i1);
-        saddle(at1_j, end_j, from_j, ahead_j, nothing3, a, aa, onto_i, tip0_i, tip1_i,
-               beside_j1, beside_i0, beside_i1);
-        summit(at0_i & at0_j, delta, a, onto_i, b, onto_j, beside_i0, beside_j0);
-        summit(at0_i & at1_j, end_j, a, onto_i, from_j, ahead_j, beside_i0, beside_j1);
-        summit(at1_i & at0_j, delta - a, from_i, ahead_i, b, onto_j, beside_i1, beside_j0);
-        summit(at1_i & at1_j, end_j - a, from_i, ahead_i, from_j, ahead_j, beside_i1, beside_j1);
+        // where the distance falls beyond a node: most nodes are out here, without their distances
+        const V da = delta.dot(a), db = delta.dot(b), both2 = both * both;
+        const V in_aa = bb * both2, in_bb = aa * both2;
+        const V b_onto = b.dot(onto_i), b_ahead = b.dot(ahead_i);
+        const V a_onto = a.dot(onto_j), a_ahead = a.dot(ahead_j);
+        const V i00 = delta.dot(onto_i), i01 = i00 + b_onto;
+        const V i10 = (delta - a).dot(ahead_i), i11 = i10 + b_ahead;
+        const V j00 = delta.dot(onto_j), j10 = j00 - a_onto;
+        const V j01 = (delta + b).dot(ahead_j), j11 = j01 - a_ahead;
+        const M down0_i = i00 + clamp01(-db * in_bb) * b_onto > T(0);
+        const M down1_i = i10 + clamp01((ab - db) * in_bb) * b_ahead > T(0);
+        const M down0_j = j00 - clamp01(da * in_aa) * a_onto < T(0);
+        const M down1_j = j01 - clamp01((da + ab) * in_aa) * a_ahead < T(0);
+        const M down00 = (da > T(0)) & (db < T(0)) & (i00 > T(0)) & (j00 < T(0));
+        const M down01 = (da > -ab) & (db > -bb) & (i01 > T(0)) & (j01 < T(0));
+        const M down10 = (da < aa) & (db < ab) & (i10 > T(0)) & (j10 < T(0));
+        const M down11 = (da < aa - ab) & (db > ab - bb) & (i11 > T(0)) & (j11 < T(0));
+        const unsigned saddle0_i = bits(at0_i & ~low_i & down0_i);
+        const unsigned saddle1_i = bits(at1_i & ~high_i & down1_i);
+        const unsigned saddle0_j = bits(at0_j & ~low_j & down0_j);
+        const unsigned saddle1_j = bits(at1_j & ~high_j & down1_j);
+        const unsigned summit00 = bits(at0_i & at0_j & down00);
+        const unsigned summit01 = bits(at0_i & at1_j & down01);
+        const unsigned summit10 = bits(at1_i & at0_j & down10);
+        const unsigned summit11 = bits(at1_i & at1_j & down11);
+        const unsigned summits = summit00 | summit01 | summit10 | summit11;
+        unsigned left = (saddle0_i | saddle1_i | saddle0_j | saddle1_j | summits)
+            & ((1u << count) - 1u);
+        for (; left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            const One start = {T(0), T(0), T(0)}, from = at_lane(delta, l);
+            const One u = at_lane(a, l), w = at_lane(b, l), end = from + w;
+            const One before_i = at_lane(onto_i, l), after_i = at_lane(ahead_i, l);
+            const One before_j = at_lane(onto_j, l), after_j = at_lane(ahead_j, l);
+            const int tips_i = ((const int*)&code_i)[l], tips_j = ((const int*)&code_j)[l];
+            const bool first_i = tips_i & 1, last_i = tips_i & 2;
+            const bool first_j = tips_j & 1, last_j = tips_j & 2;
+            if (saddle0_i >> l & 1)
+                saddle(l, start, u, before_i, from, w, before_j, first_j, last_j,
+                       beside_i0, beside_j0, beside_j1);
+            if (saddle1_i >> l & 1)
+                saddle(l, u, -u, after_i, from, w, before_j, first_j, last_j,
+                       beside_i1, beside_j0, beside_j1);
+            if (saddle0_j >> l & 1)
+                saddle(l, from, w, before_j, start, u, before_i, first_i, last_i,
+                       beside_j0, beside_i0, beside_i1);
+            if (saddle1_j >> l & 1)
+                saddle(l, end, -w, after_j, start, u, before_i, first_i, last_i,
+                       beside_j1, beside_i0, beside_i1);
+            if (!(summits >> l & 1)) continue;
+            if (summit00 >> l & 1)
+                summit(l, from, u, before_i, w, before_j, beside_i0, beside_j0);
+            if (summit01 >> l & 1)
+                summit(l, end, u, before_i, -w, after_j, beside_i0, beside_j1);
+            if (summit10 >> l & 1)
+                summit(l, from - u, -u, after_i, w, before_j, beside_i1, beside_j0);
+            if (summit11 >> l & 1)
+                summit(l, end - u, -u, after_i, -w, after_j, beside_i1, beside_j1);
+        }
     }
     M saddled = less > T(0);
     if (any(~reject | saddled)) {

@@ -81,11 +81,11 @@ _ROWS = """
 """
 
 
-# Distance vector and closest points of pairs of segments that begin at nodes; whether they are
-# nearly parallel, with a margin for rounding.
+# Distance vector and closest points of pairs of segments that begin at nodes, products of their
+# edges; whether they are nearly parallel, with a margin for rounding.
 DISTANCE = """
-    auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t, M& aligned)
-        -> V3 {
+    auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t, M& aligned,
+                       V& aa, V& bb, V& ab) -> V3 {
         P4 rows_a[W], rows_b[W], rows_d[W];
         for (int l = 0; l < W; ++l) {
             const P4 xi = place_row(node_i[l]), xj = place_row(node_j[l]);
@@ -96,8 +96,10 @@ DISTANCE = """
         const V3 a = turn(rows_a), b = turn(rows_b);
         V3 delta = turn(rows_d);
         add_images(images, delta);
-        const V aa = larger(a.dot(a), V(TINY)), bb = larger(b.dot(b), V(TINY));
-        const V ab = a.dot(b), da = delta.dot(a), db = delta.dot(b);
+        aa = larger(a.dot(a), V(TINY));
+        bb = larger(b.dot(b), V(TINY));
+        ab = a.dot(b);
+        const V da = delta.dot(a), db = delta.dot(b);
         aligned = ab * ab > T(ALIGNED) * aa * bb;
         const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
         s = clamp01((da * bb - db * ab) / den);

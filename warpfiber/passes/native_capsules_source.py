@@ -299,10 +299,24 @@ _SWEEP = """
             __builtin_prefetch(x);
             if (is_large) __builtin_prefetch(x + 5);
         }
-        V s, t;
+        V s, t, aa, bb, ab;
         M aligned;
-        const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aligned);
-        const M hit = c.dot(c) < largest_reach * largest_reach;
+        const V3 c = closest(
+            images, (const int*)&from_i, (const int*)&from_j, s, t, aligned, aa, bb, ab);
+        const V square = c.dot(c);
+        // At the far end of a segment that has a next one, that one has the contact; this one has
+        // at most saddles, and those only at nodes within a patch from which the distance falls.
+        const M on_i = ~tipped(code_i, 2), on_j = ~tipped(code_j, 2);
+        const V rest_s = T(1) - s, rest_t = T(1) - t;
+        const V wide = aa * bb - ab * ab;
+        const V most = (ROUNDED * largest_reach) * (largest_reach - root(square));
+        M idle = ~aligned & (((rest_s <= NEAR) & on_i) | ((rest_t <= NEAR) & on_j));
+        auto far = [&](V part, V other2) -> M {
+            return (part <= NEAR) | (part * part * wide > most * other2);
+        };
+        idle &= (far(s, bb) | tipped(code_i, 1)) & (far(rest_s, bb) | ~on_i);
+        idle &= (far(t, aa) | tipped(code_j, 1)) & (far(rest_t, aa) | ~on_j);
+        const M hit = (square < largest_reach * largest_reach) & ~idle;
         const unsigned line = bits(aligned);
         for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);

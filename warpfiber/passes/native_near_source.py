@@ -25,9 +25,9 @@ _NEAR = """
             ((int*)&images)[l] = pair_image[k];
             ((T*)&reach)[l] = largest_reach + skin_of(from_i[l]) + skin_of(from_j[l]);
         }
-        V s, t;
+        V s, t, aa, bb, ab;
         M aligned;
-        const V3 c = closest(images, from_i, from_j, s, t, aligned);
+        const V3 c = closest(images, from_i, from_j, s, t, aligned, aa, bb, ab);
         const M near = c.dot(c) <= reach * reach;
         for (int l = 0; l < count; ++l) {
             near_pair[found] = ks[l];
