@@ -26,31 +26,23 @@ BIN = 10  # degrees
 
 
 def contact_forces(spheres: BondedSpheres) -> dict[str, float]:
-    """Mean sizes in N; 0 without contacts."""
+    """Mean sizes in N; 0 without contacts. What hollows of kinks take off again is not counted."""
     row = {"contact_force_mean": 0.0, "contact_force_pair_mean": 0.0}
     if spheres.contacts is None:
         return row
-    contacts = spheres.contacts
-    i, j, image = contacts.search.list.host_pairs()
+    i, j, image = spheres.contacts.search.list.host_pairs()
     fiber = spheres.model.host["segment_fiber"]
-    apart = fiber[i] != fiber[j]
-    acts = (contacts.acts.numpy()[: len(i)] != 0) & apart
+    acts = (spheres.contacts.acts.numpy()[: len(i)] != 0) & (fiber[i] != fiber[j])
     if not acts.any():
         return row
-    bends = (contacts.bends.numpy()[: len(i)] != 0) & apart
-    force = np.zeros((len(i), 3))
-    force[acts] = contacts.force.numpy()[: len(i)][acts]
-    row["contact_force_mean"] = float(np.linalg.norm(force[acts], axis=1).mean())
-    # what the hollows of kinks take off
-    force[bends] += contacts.beside.numpy()[: len(i)][bends][:, :2].sum(axis=1)
-    touches = acts | bends
-    keys = fiber_pair_keys(fiber[i[touches]], fiber[j[touches]], image[touches])
+    force = spheres.contacts.force.numpy()[: len(i)][acts].astype(float)
+    force *= spheres.model.units.force
+    keys = fiber_pair_keys(fiber[i[acts]], fiber[j[acts]], image[acts])
     pairs, which = np.unique(keys, return_inverse=True)
     total = np.zeros((len(pairs), 3))
-    np.add.at(total, which, force[touches])
+    np.add.at(total, which, force)
+    row["contact_force_mean"] = float(np.linalg.norm(force, axis=1).mean())
     row["contact_force_pair_mean"] = float(np.linalg.norm(total, axis=1).mean())
-    for name in row:
-        row[name] *= spheres.model.units.force
     return row
 
 

@@ -56,9 +56,7 @@ SKIN_BENT = 5.0  # diameters, where a few fibers of many spring farther than the
 # skin, and with skins that grow as far as the box allows.
 SHORTEST_GIVEN, SHORTEST = 1.0 / 64.0, 1e-6
 FINITE = 1e20  # radii; penalties may overlap
-SLIDES = (
-    1e-5  # a contact slides whose force of friction is so near to its limit, rounding of float32
-)
+SLIDES = 1e-5  # a contact slides whose friction is so near to its limit: rounding of float32
 Launches = list[Launch | Call | Repeat]
 
 
