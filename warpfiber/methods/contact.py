@@ -147,6 +147,7 @@ class ImplicitContact:
             stretch=stretch,
             workers=workers,
             most_skin=SKIN_BENT if self.packed else MOST_SKIN,
+            slides=not self.packed,  # whose second solve has rows of walls for what is listed
         )
         rub = None
         if self.hard and (scene.contact.friction > 0.0 or scene.contact.wall_friction > 0.0):

@@ -32,6 +32,7 @@ STEP_PAIR_COST = 8.0
 PRUNED_FROM = 2000  # segments; pruning smaller lists costs its calls more than it saves
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1
+MEAN_SLIDE = 0.4  # of the farthest; where each segment has an extension of its own
 
 
 class PairSearch:
@@ -39,7 +40,8 @@ class PairSearch:
 
     `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
     of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters;
-    `prunes`: whether the list may be pruned from a wider one.
+    `prunes`: whether the list may be pruned from a wider one; `slides`: whether segments are listed
+    as much longer as each of them slides along itself.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class PairSearch:
         pair_cost: float = STEP_PAIR_COST,
         most_skin: float = MOST_SKIN,
         prunes: bool = False,
+        slides: bool = False,
     ) -> None:
         self.most_skin = most_skin
         self.scene, self.model, self.state = scene, model, state
@@ -79,6 +82,7 @@ class PairSearch:
             workers=workers,
             native=native,
             flow_origin=origin if prunes else None,
+            slide_origin=origin if slides else None,
         )
         self.lasting = lasting_height(scene) / model.units.length
         self.skin = self._skin_choice(skin)
@@ -150,7 +154,8 @@ class PairSearch:
 
     def set_extension(self, extension: float) -> None:
         """Another extension of listed segments, from the next list on."""
-        self.skin.length += 2.0 * (extension - self.list.extension)
+        share = 1.0 if self.list.slide_origin is None else MEAN_SLIDE
+        self.skin.length += 2.0 * share * (extension - self.list.extension)
         if extension != self.list.extension:
             self.list.set_extension(extension)
 
@@ -257,6 +262,8 @@ class PairSearch:
         extension = np.asarray(self.list.extension)
         known = {"stretch_allowed": allowed, "extension": extension, "skin": self.skin.saved()}
         pruning = self.list.pruning
+        if self.list.slide_origin is not None:
+            known["segment_extension"] = self.list.segment_extension.numpy().copy()
         return known | (pruning.saved() if pruning is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> bool:
@@ -266,6 +273,8 @@ class PairSearch:
         self.set_stretch(float(arrays["stretch_allowed"]))
         self.set_skin(float(saved[0]), float(saved[4]) if pruning is not None else None)
         self.set_extension(float(arrays["extension"]))
+        if self.list.slide_origin is not None:
+            self.list.segment_extension.assign(arrays["segment_extension"])
         self.skin.begun = step
         head = "list" if pruning is None else "wide"
         state.node_pos.assign(arrays[f"{head}_pos"])

@@ -68,6 +68,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segments: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
+        segment_extension: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
         deformation_back: wp.array(dtype=wp.mat33d),
         deformation: wp.array(dtype=wp.mat33d),
@@ -98,7 +99,10 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
             listed = list_pos[i + 1] - list_pos[i]
             length = wp.length(listed)
-            beyond = list_sizes[2] / length
+            longer = list_sizes[2]
+            if segment_extension.shape[0] > 0:
+                longer = segment_extension[i - fiber]
+            beyond = longer / length
             start = flow_origin + affine * (list_pos[i] - flow_origin)
             axis = affine * listed
             inverse = one / wp.dot(axis, axis)
@@ -133,6 +137,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push: mat33,
         limit: real,
         extension: real,
+        segment_extension: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
         list_pos: wp.array(dtype=vec3),
         node_back: wp.array(dtype=vec3),
@@ -152,6 +157,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segments: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
+        segment_extension: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
         deformation_back: wp.array(dtype=wp.mat33d),
         deformation: wp.array(dtype=wp.mat33d),
@@ -184,6 +190,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             push,
             farthest_motion(affine, list_sizes),
             list_sizes[2],
+            segment_extension,
             segment_node,
             list_pos,
             node_back,
