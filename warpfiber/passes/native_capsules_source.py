@@ -249,12 +249,8 @@ _LAW = """
                 pair_acts[k] = 1;
                 pair_push[k] = ((const T*)&force)[l];
                 T* f = (T*)pair_force + 3 * k;
-                T* m = (T*)pair_moment + 3 * k;
                 T* arms = (T*)pair_arms + 4 * k;
-                for (int c = 0; c < 3; ++c) {
-                    f[c] = ((const T*)(&whole.x + c))[l];
-                    m[c] = ((const T*)(&moment.x + c))[l];
-                }
+                for (int c = 0; c < 3; ++c) f[c] = ((const T*)(&whole.x + c))[l];
                 arms[0] = ((const T*)&s)[l];
                 arms[1] = ((const T*)&t)[l];
                 arms[2] = ((const T*)&arm_i)[l];
