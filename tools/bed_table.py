@@ -1,12 +1,15 @@
 """What pressed, pulled and sheared beds show, over seeds: `tools/bed_table.py FOLDER ...`.
 
-Folders are runs that differ by their seed; of every quantity the mean over them is printed, with
-the standard deviation of one run, and `-` where no run has it.
+Runs whose scenes differ by their seed alone make one column: of every quantity the mean over them,
+the standard deviation of one run, and `-` where no run has it; the head of a column names what the
+scenes differ by, and the number of runs. Pressed, pulled and sheared beds make a table each.
 Symbols: P pressure on the upper wall (`low`: on the lower), phi volume fraction, Z touching fibers
-    per fiber, F mean contact force; a number after a name is phi. Branches of the cycles are the
-    stages: settling, then loading and unloading in turn.
-Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 7 to 17.
-Limits: values at a fraction are of lines through a window of 0.005 around it.
+    per fiber, F mean contact force (`pair`: by touching pair of fibers), L_s free height between
+    the grips; a number after a name is phi. Branches of the cycles are the stages: settling, then
+    loading and unloading in turn.
+Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 4 and 7 to 17.
+Limits: values at a fraction are of lines through a window of 0.005 around it. Folders of runs that
+    have not ended are left out, and named.
 """
 
 from __future__ import annotations
@@ -16,13 +19,19 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 Rows = dict[str, np.ndarray]
+Setting = Any  # of a scene: tables, lists and values
 WINDOW = 0.005  # of phi
-FRACTIONS = (0.30, 0.35, 0.40)
+FRACTIONS = (0.20, 0.25, 0.28, 0.30, 0.35, 0.40)
+POWER_RANGES = ((0.20, 0.28), (0.30, 0.40))  # of phi, where rings and open fibers are pressed
+PRESSURES = (200.0, 500.0, 1000.0)  # Pa
 REST_PART = 0.05  # of settling, at its end: what is measured at rest
+APART = {"seed", "title", "path", "notes", "resolved", "record", "from", "volume_fraction_achieved"}
+NAMED = {"settle": "settled", "pour": "settled", "pull": "pulled", "shear": "sheared"}
 ENDED = re.compile(r"stage '.*' ended at time ([-+.\deE]+)")
 
 
@@ -51,47 +60,63 @@ def at(rows: Rows, name: str, fraction: float) -> float:
     return float(np.polyfit(away[near], rows[name][near], 1)[1])
 
 
-def fraction_at(rows: Rows, pressure: float) -> float:
-    """phi at which loading first reaches a pressure (Pa); nan if it does not."""
-    reached = rows["pressure_high"] >= pressure
-    return float(rows["volume_fraction"][np.argmax(reached)]) if reached.any() else np.nan
+def at_pressure(rows: Rows, name: str, pressure: float) -> float:
+    """A column where the pressure first passes a value (Pa), up or down; nan if it does not."""
+    above = rows["pressure_high"] >= pressure
+    passed = np.flatnonzero(above != above[0]) if len(above) else np.array([])
+    return float(rows[name][passed[0]]) if len(passed) else np.nan
 
 
-def exponent(rows: Rows) -> float:
-    """d log P / d log phi of loading, from the first to the last of FRACTIONS."""
+def exponent(rows: Rows, low: float, high: float) -> float:
+    """d log P / d log phi of loading between two fractions; nan if it does not reach the second."""
     phi = rows["volume_fraction"]
-    part = (phi > FRACTIONS[0]) & (phi < FRACTIONS[-1]) & (rows["pressure_high"] > 0.0)
-    if part.sum() < 3:
+    part = (phi > low) & (phi < high) & (rows["pressure_high"] > 0.0)
+    if part.sum() < 3 or phi.max() < high - WINDOW:
         return np.nan
     logs = np.log(phi[part]), np.log(rows["pressure_high"][part])
     return float(np.polyfit(*logs, 1)[0])
 
 
-def pressed(parts: list[Rows]) -> dict[str, float]:
+def pressed(parts: list[Rows], settles: bool) -> dict[str, float]:
     """Of a bed that settled, or of none, and was pressed and let go."""
     found: dict[str, float] = {}
-    settles = np.isnan(at(parts[0], "pressure_high", FRACTIONS[0])) and len(parts) > 1
     loads = parts[settles::2]
     unloads = parts[settles + 1 :: 2]
     if settles:
         rest = parts[0]
         late = rest["time"] > rest["time"][-1] * (1.0 - REST_PART)
         found["P low at rest, Pa"] = float(rest["pressure_low"][late].mean())
+        found["Z at rest"] = float(rest["coordination_number"][late].mean())
         found |= _inclination(rest, "at rest")
+    if not loads:
+        return found
     first = loads[0]
     for fraction in FRACTIONS:
         found[f"P {fraction:.2f}, kPa"] = 1e-3 * at(first, "pressure_high", fraction)
         found[f"P low {fraction:.2f}, kPa"] = 1e-3 * at(first, "pressure_low", fraction)
         found[f"Z {fraction:.2f}"] = at(first, "coordination_number", fraction)
         found[f"F {fraction:.2f}, mN"] = 1e3 * at(first, "contact_force_mean", fraction)
-    found["exponent"] = exponent(first)
-    for cycle, rows in enumerate(loads, 1):
-        found[f"phi at 1 kPa, cycle {cycle}"] = fraction_at(rows, 1e3)
+        if "contact_force_pair_mean" in first:
+            pair = at(first, "contact_force_pair_mean", fraction)
+            found[f"F pair {fraction:.2f}, mN"] = 1e3 * pair
+    for low, high in POWER_RANGES:
+        found[f"exponent {low:.2f} to {high:.2f}"] = exponent(first, low, high)
+    for pressure in PRESSURES:
+        name = f"phi at {1e-3 * pressure:g} kPa"
+        found[f"{name}, cycle 1"] = at_pressure(first, "volume_fraction", pressure)
+    shifts = [at_pressure(rows, "volume_fraction", 1e3) for rows in loads]
+    for cycle in range(1, len(loads)):
+        name = f"shift of cycle {cycle + 1} from {cycle} at 1 kPa"
+        found[name] = shifts[cycle] - shifts[cycle - 1]
+    found["Z at 1 kPa"] = at_pressure(first, "coordination_number", 1e3)
     if unloads:
         back = unloads[0]
         found["P 0.35 unloading, kPa"] = 1e-3 * at(back, "pressure_high", 0.35)
         found["Z 0.35 unloading"] = at(back, "coordination_number", 0.35)
+        found["Z at 1 kPa, unloading"] = at_pressure(back, "coordination_number", 1e3)
         found |= _inclination(back, "after cycle 1")
+    if len(loads) > 1:
+        found["P 0.40, cycle 2, kPa"] = 1e-3 * at(loads[1], "pressure_high", 0.40)
     return found
 
 
@@ -127,11 +152,53 @@ def drawn(parts: list[Rows], result: dict[str, float]) -> dict[str, float]:
 
 
 def figures(folder: Path) -> dict[str, float]:
-    """Quantities of one run."""
+    """Quantities of one run that has ended."""
     parts = branches(folder)
     stages = json.loads((folder / "summary.json").read_text()).get("stages", [])
     drew = [row for row in stages if any(key.startswith("yield") for key in row)]
-    return drawn(parts, drew[-1]) if drew else pressed(parts)
+    if drew:
+        return drawn(parts, drew[-1])
+    first = json.loads((folder / "scene.json").read_text())["stage"][0]
+    return pressed(parts, first["kind"] in ("settle", "pour"))
+
+
+def settings(scene: Setting, path: str = "") -> dict[str, str]:
+    """What one scene asks, by key, without its seed and what follows from other keys."""
+    found: dict[str, str] = {}
+    rows = scene.items() if isinstance(scene, dict) else enumerate(scene)
+    for key, value in rows:
+        if key in APART or (key == "end_time" and "end_strain" in scene):
+            continue
+        name = f"{path}.{key}" if path else str(key)
+        if key == "shape":
+            found[name] = " ".join(_text(part) for part in value.values() if part is not None)
+        elif isinstance(value, (dict, list)):
+            found |= settings(value, name)
+        else:
+            found[name] = _text(value)
+    return found
+
+
+def _text(value: Setting) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def columns(asked: Sequence[dict[str, str]]) -> list[str]:
+    """Heads that name what scenes differ by: last word of a key and value, of a shape its value."""
+    keys = sorted(
+        dict.fromkeys(key for one in asked for key in one), key=lambda key: ".shape" not in key
+    )
+    differing = [key for key in keys if len({one.get(key) for one in asked}) > 1]
+    heads = []
+    for one in asked:
+        words = [_word(key, one.get(key, "none")) for key in differing]
+        heads.append(", ".join(dict.fromkeys(words)))
+    return heads
+
+
+def _word(key: str, value: str) -> str:
+    last = [part for part in key.split(".") if not part.isdigit()][-1]
+    return value if last == "shape" else f"{last} {value}"
 
 
 def summed(runs: Sequence[dict[str, float]]) -> dict[str, tuple[float, float, int]]:
@@ -146,15 +213,47 @@ def summed(runs: Sequence[dict[str, float]]) -> dict[str, tuple[float, float, in
     return found
 
 
+def table(runs: Sequence[tuple[dict[str, str], dict[str, float]]]) -> list[str]:
+    """Lines of a Markdown table: a row per quantity, a column per scene."""
+    groups: dict[str, list[tuple[dict[str, str], dict[str, float]]]] = {}
+    for asked, found in runs:
+        groups.setdefault(json.dumps(asked, sort_keys=True), []).append((asked, found))
+    heads = columns([group[0][0] for group in groups.values()])
+    sums = [summed([found for _, found in group]) for group in groups.values()]
+    counts = [len(group) for group in groups.values()]
+    named = [f"{head} ({n})" if head else f"({n})" for head, n in zip(heads, counts, strict=True)]
+    lines = ["| quantity | " + " | ".join(named) + " |", "|---" * (len(named) + 1) + "|"]
+    for name in dict.fromkeys(name for one in sums for name in one):
+        pairs = zip(sums, counts, strict=True)
+        cells = [_shown(one.get(name, (np.nan, np.nan, 0)), n) for one, n in pairs]
+        if any(cell != "-" for cell in cells):
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _shown(value: tuple[float, float, int], runs: int) -> str:
+    mean, spread, count = value
+    if count == 0:
+        return "-"
+    text = f"{mean:.4g}" + (f" ± {spread:.2g}" if count > 1 else "")
+    return text if count == runs else f"{text} ({count})"
+
+
 def main(folders: Sequence[str]) -> None:
-    """Print the table."""
+    """Print the tables."""
     if not folders:
         raise SystemExit(__doc__)
-    table = summed([figures(Path(folder)) for folder in folders])
-    for name, (mean, spread, count) in table.items():
-        shown = "-" if count == 0 else f"{mean:.4g}"
-        shown += f" ± {spread:.2g}" if count > 1 else ""
-        print(f"{name:40} {shown}  ({count})")
+    kinds: dict[str, list[tuple[dict[str, str], dict[str, float]]]] = {}
+    for folder in filter(Path.is_dir, map(Path, folders)):
+        if not (folder / "summary.json").exists():
+            print(f"{folder}: no summary.json, not ended; left out", file=sys.stderr)
+            continue
+        scene = json.loads((folder / "scene.json").read_text())
+        kind = NAMED.get(scene["stage"][-1]["kind"], "pressed")
+        kinds.setdefault(kind, []).append((settings(scene), figures(folder)))
+    for kind, runs in kinds.items():
+        print(f"\n{kind}\n")
+        print("\n".join(table(runs)))
 
 
 if __name__ == "__main__":
