@@ -5,9 +5,11 @@ the standard deviation of one run, and `-` where no run has it; the head of a co
 scenes differ by, and the number of runs. Pressed, pulled and sheared beds make a table each.
 Symbols: P pressure on the upper wall (`low`: on the lower), phi volume fraction, Z touching fibers
     per fiber, F mean contact force (`pair`: by touching pair of fibers), L_s free height between
-    the grips; a number after a name is phi. Branches of the cycles are the stages: settling, then
-    loading and unloading in turn.
-Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 4 and 7 to 17.
+    the grips, D_F maximum Feret diameter of the stress-free shape, L_c length of the centerline, d
+    diameter; a number after a name is phi. Branches of the cycles are the stages: settling, then
+    loading and unloading in turn. Below the tables of pulled and sheared beds: rank correlations
+    (Spearman) of the yield stress with kappa (0: straight), D_F / L_c and L_s / d.
+Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 4 and 7 to 18.
 Limits: values at a fraction are of lines through a window of 0.005 around it. Folders of runs that
     have not ended are left out, and named.
 """
@@ -22,6 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from warpfiber.placement.shapes import feret_diameter, rest_nodes
+from warpfiber.scene import Shape
 
 Rows = dict[str, np.ndarray]
 Setting = Any  # of a scene: tables, lists and values
@@ -151,15 +156,36 @@ def drawn(parts: list[Rows], result: dict[str, float]) -> dict[str, float]:
     }
 
 
+def finished(folder: Path) -> bool:
+    """Whether a run has reached the end of its last stage."""
+    file = folder / "summary.json"
+    return file.exists() and json.loads(file.read_text()).get("outcome") == "finished"
+
+
 def figures(folder: Path) -> dict[str, float]:
     """Quantities of one run that has ended."""
     parts = branches(folder)
     stages = json.loads((folder / "summary.json").read_text()).get("stages", [])
     drew = [row for row in stages if any(key.startswith("yield") for key in row)]
+    scene = json.loads((folder / "scene.json").read_text())
     if drew:
-        return drawn(parts, drew[-1])
-    first = json.loads((folder / "scene.json").read_text())["stage"][0]
-    return pressed(parts, first["kind"] in ("settle", "pour"))
+        return measures(scene) | drawn(parts, drew[-1])
+    return pressed(parts, scene["stage"][0]["kind"] in ("settle", "pour"))
+
+
+def measures(scene: Setting) -> dict[str, float]:
+    """L_s / d, D_F / L_c and kappa (1/m; of straight and S fibers) of a bed between grips."""
+    fiber, stage = scene["fibers"][0], scene["stage"][-1]
+    length, diameter = fiber["centerline_length"], fiber["diameter"]
+    shape = Shape(**fiber["shape"])
+    found = {
+        "L_s / d": (stage["freeze_above"] - stage["freeze_below"]) / diameter,
+        "D_F / L_c": feret_diameter(rest_nodes(shape, length, fiber["segments"], diameter))
+        / length,
+    }
+    if shape.kind in ("straight", "s"):
+        found["kappa, 1/m"] = shape.curvature or 0.0
+    return found
 
 
 def settings(scene: Setting, path: str = "") -> dict[str, str]:
@@ -239,14 +265,47 @@ def _shown(value: tuple[float, float, int], runs: int) -> str:
     return text if count == runs else f"{text} ({count})"
 
 
+def ranks(values: np.ndarray) -> np.ndarray:
+    """Ranks from 0 of values (n,), equal ones at the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(count) - 0.5 * (count + 1))[place])
+
+
+def trends(runs: Sequence[dict[str, float]]) -> list[str]:
+    """Lines with the rank correlation of the yield stress with each measure, the others held.
+
+    Kappa and D_F at one L_s, L_s at one D_F; three values of a measure make a trend.
+    """
+    lines = []
+    for name, held in (
+        ("kappa, 1/m", "L_s / d"),
+        ("D_F / L_c", "L_s / d"),
+        ("L_s / d", "D_F / L_c"),
+    ):
+        for value in sorted({round(run[held], 3) for run in runs}):
+            part = [run for run in runs if round(run[held], 3) == value and name in run]
+            measure = np.array([run[name] for run in part])
+            if len(np.unique(measure)) < 3:
+                continue
+            stress = np.array([next(run[key] for key in run if "yield" in key) for run in part])
+            rank = float(np.corrcoef(ranks(measure), ranks(stress))[0, 1])
+            low, high = (stress[measure == end].mean() for end in (measure.min(), measure.max()))
+            lines.append(
+                f"yield stress against {name} at {held} = {value:g}: Spearman {rank:.2f} over "
+                f"{len(part)} runs; from {low:.3g} at {measure.min():.3g} to {high:.3g} kPa at "
+                f"{measure.max():.3g}"
+            )
+    return lines
+
+
 def main(folders: Sequence[str]) -> None:
     """Print the tables."""
     if not folders:
         raise SystemExit(__doc__)
     kinds: dict[str, list[tuple[dict[str, str], dict[str, float]]]] = {}
     for folder in filter(Path.is_dir, map(Path, folders)):
-        if not (folder / "summary.json").exists():
-            print(f"{folder}: no summary.json, not ended; left out", file=sys.stderr)
+        if not finished(folder):
+            print(f"{folder}: has not run to its end; left out", file=sys.stderr)
             continue
         scene = json.loads((folder / "scene.json").read_text())
         kind = NAMED.get(scene["stage"][-1]["kind"], "pressed")
@@ -254,6 +313,8 @@ def main(folders: Sequence[str]) -> None:
     for kind, runs in kinds.items():
         print(f"\n{kind}\n")
         print("\n".join(table(runs)))
+        if kind in ("pulled", "sheared"):
+            print("\n".join(["", *trends([found for _, found in runs])]))
 
 
 if __name__ == "__main__":

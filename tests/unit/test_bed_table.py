@@ -39,7 +39,7 @@ def written(
     np.savetxt(folder / "scalars.csv", table, delimiter=",", header=header, comments="")
     lines = [f"[  1.00 s] stage 'a' ended at time {end:g} s" for end in ends]
     (folder / "log.txt").write_text("\n".join(["begun", *lines]))
-    (folder / "summary.json").write_text(json.dumps({"stages": stages}))
+    (folder / "summary.json").write_text(json.dumps({"outcome": "finished", "stages": stages}))
     asked = {"title": folder.name, "stage": [{"kind": kind} for kind in kinds], **scene}
     (folder / "scene.json").write_text(json.dumps(asked))
     return folder
@@ -68,6 +68,22 @@ def cycles(folder: Path, scale: float, **scene: object) -> Path:
         "inclination_10_20": np.full(500, 0.15),
     }
     return written(folder, columns, [1.0, 2.0, 3.0, 4.0, 5.0], [], **scene)
+
+
+STRAIGHT: dict[str, object] = {"kind": "straight"}
+
+
+def drawn(
+    folder: Path,
+    columns: dict[str, np.ndarray],
+    stages: list,
+    shape: dict[str, object],
+    height: float = 0.02,
+) -> Path:
+    """A run that pulled or sheared fibers of length 0.06, diameter 0.002 m over a free height."""
+    fiber = {"shape": shape, "centerline_length": 0.06, "diameter": 0.002, "segments": 24}
+    stage = {"kind": "shear", "freeze_below": 0.03, "freeze_above": 0.03 + height}
+    return written(folder, columns, [2.0], stages, fibers=[fiber], stage=[stage])
 
 
 def cells(told: str, name: str) -> list[list[float]]:
@@ -110,12 +126,39 @@ def test_pulled_and_sheared(tmp_path: Path) -> None:
         "coordination_number": np.where(strain > 1.0, 12.0, 6.0),
     }
     pull = {"stage": "pull", "yield_stress_zz": 2e4, "yield_strain": 0.5}
-    found = bed_table.figures(written(tmp_path / "pull", columns, [2.0], [pull]))
+    found = bed_table.figures(drawn(tmp_path / "pull", columns, [pull], STRAIGHT))
     assert found["yield tension, kPa"] == 20.0 and found["its strain"] == 0.5
     assert found["stress at twice that strain over peak"] == pytest.approx(0.5 * np.exp(-1.0))
     shear = {"stage": "shear", "yield_stress_xz": 3e4, "standard_deviation": 2e3}
-    found = bed_table.figures(written(tmp_path / "shear", columns, [2.0], [shear]))
+    found = bed_table.figures(drawn(tmp_path / "shear", columns, [shear], {"kind": "z"}))
     assert found["yield shear, kPa"] == 30.0 and found["Z, second half"] == 12.0
+    assert found["L_s / d"] == pytest.approx(10.0) and "kappa, 1/m" not in found
+    assert found["D_F / L_c"] == pytest.approx(0.5**0.5)
+
+
+def test_trends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rank correlations of the yield stress: with kappa, with D_F, with equal values between."""
+    strain = np.linspace(0.0, 2.0, 21)[1:]
+    columns = {"time": strain, "grip_strain": strain, "coordination_number": 0.0 * strain}
+    asked: list[tuple[dict[str, object], float]] = [
+        (STRAIGHT, 30.0),
+        (STRAIGHT, 40.0),
+        ({"kind": "s", "curvature": 44.0}, 35.0),
+        ({"kind": "s", "curvature": 100.0}, 20.0),
+        ({"kind": "z"}, 10.0),
+    ]
+    folders = []
+    for k, (shape, stress) in enumerate(asked):
+        shear = {"yield_stress_xz": 1e3 * stress, "standard_deviation": 1.0}
+        folders.append(str(drawn(tmp_path / str(k), columns, [shear], shape)))
+    longer = drawn(tmp_path / "longer", columns, [shear], STRAIGHT, height=0.03)
+    bed_table.main([*folders, str(longer)])
+    told = capsys.readouterr().out
+    # ranks of kappa 0.5, 0.5, 2, 3 and of the stress 1, 3, 2, 0
+    assert "kappa, 1/m at L_s / d = 10: Spearman -0.63 over 4 runs; from 35 at 0 to 20 kPa" in told
+    # ranks of D_F 3.5, 3.5, 2, 0, 1 and of the stress 2, 4, 3, 1, 0
+    assert "D_F / L_c at L_s / d = 10: Spearman 0.72 over 5 runs; from 20 at 0.665 to 35" in told
+    assert "against L_s / d" not in told
 
 
 def test_over_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -154,8 +197,8 @@ def test_columns_of_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         cycles(tmp_path / "b", 2e6, seed=2, start={"from": "y"}, **asked(44.0)),
         cycles(tmp_path / "c", 3e6, seed=1, start={"from": "z"}, **asked(100.0)),
     ]
-    unfinished = tmp_path / "d"
-    unfinished.mkdir()
+    unfinished = cycles(tmp_path / "d", 9e6, **asked(100.0))
+    (unfinished / "summary.json").write_text(json.dumps({"outcome": "diverged"}))
     bed_table.main([str(run) for run in [*runs, unfinished]])
     told = capsys.readouterr()
     assert "| quantity | s 44 (2) | s 100 (1) |" in told.out
@@ -163,7 +206,7 @@ def test_columns_of_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     first, second = cells(told.out, "P 0.40, kPa")
     assert first == pytest.approx([1.5 * unit, unit * 0.5**0.5], rel=2e-2)
     assert second == pytest.approx([3.0 * unit], rel=2e-2)
-    assert "d: no summary.json" in told.err
+    assert "d: has not run to its end" in told.err
     assert "P 0.25" in told.out and "P 0.20" not in told.out
 
 
