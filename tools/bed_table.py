@@ -10,8 +10,8 @@ Symbols: P pressure on the upper wall (`low`: on the lower), phi volume fraction
     loading and unloading in turn. Below the tables of pulled and sheared beds: rank correlations
     (Spearman) of the yield stress with kappa (0: straight), D_F / L_c and L_s / d.
 Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 4 and 7 to 18.
-Limits: values at a fraction are of lines through a window of 0.005 around it. Folders of runs that
-    have not ended are left out, and named.
+Limits: values at a fraction are of lines through a window of 0.005 around it, values at a pressure
+    of means over such windows. Folders of runs that have not ended are left out, and named.
 """
 
 from __future__ import annotations
@@ -66,10 +66,25 @@ def at(rows: Rows, name: str, fraction: float) -> float:
 
 
 def at_pressure(rows: Rows, name: str, pressure: float) -> float:
-    """A column where the pressure first passes a value (Pa), up or down; nan if it does not."""
-    above = rows["pressure_high"] >= pressure
-    passed = np.flatnonzero(above != above[0]) if len(above) else np.array([])
-    return float(rows[name][passed[0]]) if len(passed) else np.nan
+    """A column where the pressure first passes a value (Pa), up or down; nan if it does not.
+
+    Of means over windows of phi, a line between the two windows about it: beds swing.
+    """
+    window = np.round(rows["volume_fraction"] / WINDOW)
+    if not len(window):
+        return np.nan
+    cut = np.flatnonzero(np.diff(window)) + 1
+    high, value = (
+        np.array([part.mean() for part in np.split(rows[key], cut)])
+        for key in ("pressure_high", name)
+    )
+    above = high >= pressure
+    passed = np.flatnonzero(above != above[0])
+    if not len(passed):
+        return np.nan
+    after = passed[0]
+    part = (pressure - high[after - 1]) / (high[after] - high[after - 1])
+    return float(value[after - 1] + part * (value[after] - value[after - 1]))
 
 
 def exponent(rows: Rows, low: float, high: float) -> float:
