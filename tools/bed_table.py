@@ -1,4 +1,4 @@
-"""What pressed, pulled and sheared beds show, over seeds: `tools/bed_table.py FOLDER ...`.
+"""What pressed, pulled and sheared beds show: `tools/bed_table.py [--picture PNG] FOLDER ...`.
 
 Runs whose scenes differ by their seed alone make one column: of every quantity the mean over them,
 the standard deviation of one run, and `-` where no run has it; the head of a column names what the
@@ -8,7 +8,8 @@ Symbols: P pressure on the upper wall (`low`: on the lower), phi volume fraction
     the grips, D_F maximum Feret diameter of the stress-free shape, L_c length of the centerline, d
     diameter; a number after a name is phi. Branches of the cycles are the stages: settling, then
     loading and unloading in turn. Below the tables of pulled and sheared beds: rank correlations
-    (Spearman) of the yield stress with kappa (0: straight), D_F / L_c and L_s / d.
+    (Spearman) of the yield stress with kappa (0: straight), D_F / L_c and L_s / d. The picture
+    shows the yield stress over D_F / L_c, a point per column and a bar of one deviation.
 Source: the quantities are those of Xu, Ma & Guo 2023, Figs. 4 and 7 to 18.
 Limits: values at a fraction are of lines through a window of 0.005 around it, values at a pressure
     of means over such windows. Folders of runs that have not ended are left out, and named.
@@ -16,6 +17,7 @@ Limits: values at a fraction are of lines through a window of 0.005 around it, v
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -276,7 +278,7 @@ def _shown(value: tuple[float, float, int], runs: int) -> str:
     mean, spread, count = value
     if count == 0:
         return "-"
-    text = f"{mean:.4g}" + (f" ± {spread:.2g}" if count > 1 else "")
+    text = f"{mean:.4g}" + (f" ± {spread:.2g}" if spread > 0.0 else "")
     return text if count == runs else f"{text} ({count})"
 
 
@@ -313,23 +315,66 @@ def trends(runs: Sequence[dict[str, float]]) -> list[str]:
     return lines
 
 
-def main(folders: Sequence[str]) -> None:
-    """Print the tables."""
-    if not folders:
-        raise SystemExit(__doc__)
+def points(runs: Sequence[dict[str, float]]) -> dict[float, list[tuple[float, float, float]]]:
+    """By L_s / d: D_F / L_c, mean yield stress and its deviation (kPa; 0 of one run)."""
+    found: dict[float, list[tuple[float, float, float]]] = {}
+    for height, feret in sorted({(round(r["L_s / d"], 1), round(r["D_F / L_c"], 4)) for r in runs}):
+        same = [
+            run
+            for run in runs
+            if (round(run["L_s / d"], 1), round(run["D_F / L_c"], 4)) == (height, feret)
+        ]
+        stress = [next(run[key] for key in run if "yield" in key) for run in same]
+        spread = float(np.std(stress, ddof=1)) if len(stress) > 1 else 0.0
+        found.setdefault(height, []).append((feret, float(np.mean(stress)), spread))
+    return found
+
+
+def picture(kinds: dict[str, list[dict[str, float]]], file: Path) -> None:
+    """Yield stress over D_F / L_c, an axes for each kind of test."""
+    from matplotlib.figure import Figure
+
+    from warpfiber.output.axes_style import GRAY, plain_axes
+
+    figure = Figure(figsize=(4.2 * len(kinds), 3.2), layout="constrained")
+    boxes = figure.subplots(1, len(kinds), squeeze=False)[0]
+    for axes, (kind, runs) in zip(boxes, kinds.items(), strict=True):
+        for height, rows in points(runs).items():
+            feret, stress, spread = np.array(rows).T
+            axes.errorbar(feret, stress, spread, marker="o", ms=4, capsize=3, lw=1,
+                          label=f"$L_s / d$ = {height:g}")  # fmt: skip
+        plain_axes(axes)
+        axes.set_ylim(bottom=0.0)
+        axes.set_title(kind, loc="left", fontsize=11)
+        axes.set_xlabel("maximum Feret diameter / centerline", color=GRAY)
+        axes.set_ylabel("yield stress (kPa)", color=GRAY)
+        axes.legend(frameon=False, labelcolor=GRAY)
+    figure.savefig(file, dpi=110)
+
+
+def main(words: Sequence[str]) -> None:
+    """Print the tables; draw the picture that is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path, help="of runs")
+    parser.add_argument("--picture", type=Path, help="PNG of yield stresses over D_F / L_c")
+    asked = parser.parse_args(words)
     kinds: dict[str, list[tuple[dict[str, str], dict[str, float]]]] = {}
-    for folder in filter(Path.is_dir, map(Path, folders)):
+    for folder in filter(Path.is_dir, asked.folders):
         if not finished(folder):
             print(f"{folder}: has not run to its end; left out", file=sys.stderr)
             continue
         scene = json.loads((folder / "scene.json").read_text())
         kind = NAMED.get(scene["stage"][-1]["kind"], "pressed")
         kinds.setdefault(kind, []).append((settings(scene), figures(folder)))
+    drew = {}
     for kind, runs in kinds.items():
         print(f"\n{kind}\n")
         print("\n".join(table(runs)))
         if kind in ("pulled", "sheared"):
-            print("\n".join(["", *trends([found for _, found in runs])]))
+            drew[kind] = [found for _, found in runs]
+            print("\n".join(["", *trends(drew[kind])]))
+    if asked.picture is not None and drew:
+        picture(drew, asked.picture)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,12 @@ def test_trends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         shear = {"yield_stress_xz": 1e3 * stress, "standard_deviation": 1.0}
         folders.append(str(drawn(tmp_path / str(k), columns, [shear], shape)))
     longer = drawn(tmp_path / "longer", columns, [shear], STRAIGHT, height=0.03)
-    bed_table.main([*folders, str(longer)])
+    png = tmp_path / "yields.png"
+    bed_table.main([*folders, str(longer), "--picture", str(png)])
+    assert png.read_bytes()[:4] == b"\x89PNG"
+    shown = bed_table.points([bed_table.figures(Path(folder)) for folder in [*folders, longer]])
+    assert list(shown) == [10.0, 15.0] and [len(rows) for rows in shown.values()] == [4, 1]
+    assert shown[10.0][-1] == (1.0, 35.0, pytest.approx(50.0**0.5))
     told = capsys.readouterr().out
     # ranks of kappa 0.5, 0.5, 2, 3 and of the stress 1, 3, 2, 0
     assert "kappa, 1/m at L_s / d = 10: Spearman -0.63 over 4 runs; from 35 at 0 to 20 kPa" in told
