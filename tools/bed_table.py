@@ -34,7 +34,6 @@ Rows = dict[str, np.ndarray]
 Setting = Any  # of a scene: tables, lists and values
 WINDOW = 0.005  # of phi
 FRACTIONS = (0.20, 0.25, 0.28, 0.30, 0.35, 0.40)
-POWER_RANGES = ((0.20, 0.28), (0.30, 0.40))  # of phi, where rings and open fibers are pressed
 PRESSURES = (200.0, 500.0, 1000.0)  # Pa
 REST_PART = 0.05  # of settling, at its end: what is measured at rest
 APART = {"seed", "title", "path", "notes", "resolved", "record", "from", "volume_fraction_achieved"}
@@ -89,14 +88,14 @@ def at_pressure(rows: Rows, name: str, pressure: float) -> float:
     return float(value[after - 1] + part * (value[after] - value[after - 1]))
 
 
-def exponent(rows: Rows, low: float, high: float) -> float:
-    """d log P / d log phi of loading between two fractions; nan if it does not reach the second."""
-    phi = rows["volume_fraction"]
-    part = (phi > low) & (phi < high) & (rows["pressure_high"] > 0.0)
-    if part.sum() < 3 or phi.max() < high - WINDOW:
+def exponent(rows: Rows) -> float:
+    """d log P / d log phi over the last decade of P of a loading."""
+    phi, high = rows["volume_fraction"], rows["pressure_high"]
+    low = at_pressure(rows, "volume_fraction", 0.1 * high.max())
+    part = (phi > low) & (high > 0.0)
+    if part.sum() < 3:
         return np.nan
-    logs = np.log(phi[part]), np.log(rows["pressure_high"][part])
-    return float(np.polyfit(*logs, 1)[0])
+    return float(np.polyfit(np.log(phi[part]), np.log(high[part]), 1)[0])
 
 
 def pressed(parts: list[Rows], settles: bool) -> dict[str, float]:
@@ -121,8 +120,7 @@ def pressed(parts: list[Rows], settles: bool) -> dict[str, float]:
         if "contact_force_pair_mean" in first:
             pair = at(first, "contact_force_pair_mean", fraction)
             found[f"F pair {fraction:.2f}, mN"] = 1e3 * pair
-    for low, high in POWER_RANGES:
-        found[f"exponent {low:.2f} to {high:.2f}"] = exponent(first, low, high)
+    found["exponent, last decade of P"] = exponent(first)
     for pressure in PRESSURES:
         name = f"phi at {1e-3 * pressure:g} kPa"
         found[f"{name}, cycle 1"] = at_pressure(first, "volume_fraction", pressure)

@@ -102,7 +102,7 @@ def test_pressed(tmp_path: Path) -> None:
     assert found["Z 0.40"] == pytest.approx(16.0, rel=2e-3)
     assert found["F 0.30, mN"] == pytest.approx(30.0, rel=2e-3)
     assert found["F pair 0.30, mN"] == pytest.approx(60.0, rel=2e-3)
-    assert found["exponent 0.30 to 0.40"] == pytest.approx(6.0, rel=1e-3)
+    assert found["exponent, last decade of P"] == pytest.approx(6.0, rel=1e-3)
     first = 1e-3 ** (1.0 / 6.0)
     row = 2.3e-3  # the way of one row in phi
     assert found["phi at 1 kPa, cycle 1"] == pytest.approx(first, abs=row)
@@ -173,7 +173,7 @@ def test_over_seeds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mean, spread, count = table["P 0.40, kPa"]
     unit = 1e3 * 0.4**6
     assert (mean, spread, count) == pytest.approx((2.0 * unit, unit, 3), rel=2e-3)
-    assert table["exponent 0.30 to 0.40"][1] < 1e-9
+    assert table["exponent, last decade of P"][1] < 1e-9
     assert bed_table.summed([{"a": 1.0}, {"a": np.nan, "b": 2.0}])["a"][::2] == (1.0, 1)
     bed_table.main([*folders, str(tmp_path / "none")])
     told = capsys.readouterr().out
