@@ -26,7 +26,7 @@ from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
-from warpfiber.passes.host_writes import write_array
+from warpfiber.passes.host_arrays import host_view, write_array
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.overlap_choice import OverlapChoice
 from warpfiber.passes.row_slip import Friction, RowSlip
@@ -259,8 +259,8 @@ class ImplicitContact:
             words[[EXPIRED, HALT]] = 0
             self.state.status.assign(words)
             return True
-        use = self.check.list_use.numpy()[0].copy()
-        if self.check.share_back.numpy()[0] == FORESEEN:  # what the next step would have found
+        use = host_view(self.check.list_use)[0].copy()
+        if host_view(self.check.share_back)[0] == FORESEEN:  # what the next step would have found
             use[:2] *= 1.0 + 1.0 / max(1, step - self.search.skin.built_step)
         if not self.search.use_up(step, use):
             self._halve()

@@ -24,6 +24,7 @@ from warpfiber.methods.skin import (
     SkinChoice,
 )
 from warpfiber.model import PAIR_COUNT, Model, State
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
 
@@ -170,7 +171,7 @@ class PairSearch:
 
     def choose_skin(self, step: int, used: float | None = None) -> None:
         """Another skin, the present one being used up; `used` of it per step, if that is known."""
-        listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
+        listed = float(host_view(self.state.status)[PAIR_COUNT]) / self.model.segment_count
         skin = self.skin.choose(step, listed, used)
         self.set_skin(skin, self.skin.choose_margin(skin, listed))
 
@@ -198,9 +199,12 @@ class PairSearch:
 
     def _share(self, use: np.ndarray | None) -> float:
         """Part of the skin that motion across the segments used up; 0 if that is not known."""
-        if use is None or not np.isfinite(use).all() or use[2] <= 0.0:
+        if use is None:
             return 0.0
-        return float(use[1] / use[2])
+        slid, across, limit = (float(value) for value in use)
+        if not math.isfinite(slid + across + limit) or limit <= 0.0:
+            return 0.0
+        return across / limit
 
     def prune(self, step: int) -> bool:
         """Prune the wide list anew, the present one being used up; False if a build is due."""

@@ -250,6 +250,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         chunks: wp.int32,
         segment_overlap: wp.array(dtype=real),
         segment_crossed: wp.array(dtype=wp.int32),
+        row_count: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         overlap_at_out: wp.array(dtype=wp.int32),
         crossed_out: wp.array(dtype=wp.int32),
@@ -258,6 +259,9 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         """Segment with the largest overlap of every run of segments, and its crossings."""
         if status[wp.static(HALT)] != 0:
             return
+        if wp.static(features.renewed):  # else nothing was looked at again
+            if row_count[0] == 0:
+                return
         chunk = wp.tid()
         segments = wp.int64(segment_overlap.shape[0])
         begin = wp.int32(segments * wp.int64(chunk) / wp.int64(chunks))

@@ -98,6 +98,7 @@ class ContactCheck:
             second = dataclasses.replace(features, again=True, renewed=True, picked=False)
             renewed = make_check_sweeps(name, second, kernel_module("check", name, second))
             self.kernels["check_again"] = renewed["check_segments"]
+            self.kernels["reduce_again"] = renewed["reduce_check"]
         self.kernels |= make_list_bound(name, module, self.native)
         self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
@@ -166,14 +167,16 @@ class ContactCheck:
         ]
         chunks = self.overlap_at.shape[0]
         reduced = [self.overlap_at, self.crossed_of, self.crossed_at]
+        reduce = "reduce_again" if name == "check_again" else "reduce_check"
+        moved = self.solves[1][0].row_count if self.renews else self.found
         finish = [self.overlap, self.overlap_partner, self.crossed_partner, *reduced]
         return [
             *([] if name == "check_again" else self._pairs(widest)),
             self._launch(name, model.segment_count, segments, split=True),
             self._launch(
-                "reduce_check",
+                reduce,
                 chunks,
-                [chunks, self.overlap, self.crossed, state.status, *reduced],
+                [chunks, self.overlap, self.crossed, moved, state.status, *reduced],
             ),
             self._launch("finish_check", 1, [*finish, state.status, self.largest, self.found]),
         ]

@@ -20,6 +20,7 @@ from warpfiber.laws.lubrication import OUTER
 from warpfiber.model import Model, State
 from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.native_row_fill import fill_pairs, make_native_row_fill
 from warpfiber.passes.native_row_slots import FIRST, LAST
@@ -156,7 +157,7 @@ class ContactRows:
 
     def grow(self) -> bool:
         """More room if the last step did not fit; then its launches are to be made again."""
-        need = int(self.row_need.numpy()[0])
+        need = int(host_view(self.row_need)[0])
         if need == 0:
             return False
         kept = self._carried()

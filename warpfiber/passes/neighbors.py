@@ -38,7 +38,7 @@ from warpfiber.passes.cells import (
     make_cell_kernels,
 )
 from warpfiber.passes.executor import Executor
-from warpfiber.passes.host_writes import write_array
+from warpfiber.passes.host_arrays import host_view, write_array
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_extension import make_extension_kernels
 from warpfiber.passes.list_launches import list_launches
@@ -291,7 +291,7 @@ class NeighborList:
     @property
     def pair_count(self) -> int:
         """Number of listed pairs."""
-        return int(self.state.status.numpy()[PAIR_COUNT])
+        return int(host_view(self.state.status)[PAIR_COUNT])
 
     @property
     def kept_count(self) -> int:
@@ -329,7 +329,7 @@ class NeighborList:
                 launches, device = list_launches(self), self.model.device
                 self._executor = Executor(launches, device, self.workers, single=True)
             self._executor.run(1, _never)
-            status = self.state.status.numpy()
+            status = host_view(self.state.status)
             overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])
             lost = self._lost_fiber() if overflow or stretched else None
             if overflow == 0 and (not stretched or lost is not None):
