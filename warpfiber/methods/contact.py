@@ -265,12 +265,7 @@ class ImplicitContact:
         if not self.search.use_up(step, use):
             self._halve()
         write_array(self.check.share_back, 0.0)
-        self._forget_pairs()
         return self.search.refresh(step)
-
-    def _forget_pairs(self) -> None:
-        """Nothing is known yet of the pairs of a new list."""
-        write_array(self.solves[0][0].pairs_known, 0)
 
     def _halve(self) -> None:
         """Half the step, as no list lasts the whole; raises SceneError if none is worth taking."""
@@ -301,7 +296,7 @@ class ImplicitContact:
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
         """Take over what `saved` returned."""
         self.search.restore(arrays, step)
-        self._forget_pairs()
+        write_array(self.check.pairs_known, 0)
         self.check.share_back.assign(arrays["list_share"])
         for number, (rows, _) in enumerate(self.solves):
             head = f"rows{number}_"

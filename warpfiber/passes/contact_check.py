@@ -230,6 +230,7 @@ class ContactCheck:
             node_pos,
             *self._shifts(),
             state.status,
+            self.pairs_known,
             self.step_strain,
             self.segment_moved,
             self.part_short,

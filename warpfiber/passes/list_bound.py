@@ -61,6 +61,12 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         """F of the step alone."""
         return mat33(after[0] * wp.inverse(before[0]))
 
+    @wp.func
+    def is_new(before: wp.array(dtype=wp.mat33d)) -> wp.bool:
+        """Whether the flow has carried nothing since the build: pairs are not those of before."""
+        carried = before[0] - wp.identity(n=3, dtype=wp.float64)
+        return wp.ddot(carried, carried) == wp.float64(0.0)
+
     @wp.kernel(**options)
     def bound_fibers(
         offset: wp.int32,
@@ -78,6 +84,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
+        pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
@@ -92,6 +99,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push = step_push(deformation_back, deformation)
         if fiber == 0:
             step_strain_out[0] = largest_strain(push)
+            if is_new(deformation_back):
+                pairs_known_out[0] = 0
         found = wp.int32(0)
         slid = zero
         across = zero
@@ -167,6 +176,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
+        pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
@@ -181,6 +191,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push = step_push(deformation_back, deformation)
         if chunk == 0:
             step_strain_out[0] = largest_strain(push)
+            if is_new(deformation_back):
+                pairs_known_out[0] = 0
         bound_block(
             first,
             wp.min(first + wp.static(CHUNK_SEGMENTS), segments),
@@ -236,7 +248,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
     ):
         """At the end of a step that is kept; `share_back` its share, 0 where the list is new.
 
-        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one.
+        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one,
+        unless the list is new by then.
         """
         if status[wp.static(HALT)] + rejected[0] != 0:
             return
