@@ -36,6 +36,7 @@ from warpfiber.passes.grip_meter import make_grip_meter, make_grip_sum
 from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.joined_steps import make_gates
 from warpfiber.passes.list_bound import make_list_bound
+from warpfiber.passes.list_extension import make_extension_kernels
 from warpfiber.passes.measure import (
     MeasureFeatures,
     make_measure_fibers,
@@ -80,7 +81,7 @@ _RINGS = replace(_BED, container=True, closed=True)
 _GRIPPED = replace(_BED, press=2, loads=True, grips=True, planes=1)
 _RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
-_LISTED = ListFeatures(ALL, (0, 2), True, True, True, True)
+_LISTED = ListFeatures(ALL, (0, 2), True, True, True, True, True)
 _ROWS = RowFeatures(True, FLOOR, "shifted", True)
 _CHOSEN = RowFeatures(True, FLOOR, "none", True, True)
 
@@ -140,6 +141,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_check_sweeps, (CheckFeatures(True, FLOOR, True, True, True, True, True, True),)),
     (make_pair_motion, (True,)),
     (make_list_bound, ()),
+    (make_extension_kernels, ()),
     (make_wide_kernels, ()),
     (make_plain_prune, (True,)),
     (make_measure_fibers, (MeasureFeatures(True, True, True, ALL),)),

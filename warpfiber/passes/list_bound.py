@@ -136,6 +136,56 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
         share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
 
+    @wp.kernel(**options)
+    def bound_list(
+        fiber_short: wp.array(dtype=wp.int32),
+        fiber_use: wp.array(dtype=vec3),
+        fiber_share: wp.array(dtype=real),
+        status: wp.array(dtype=wp.int32),
+        list_short_out: wp.array(dtype=wp.int32),
+        list_use_out: wp.array(dtype=vec3),
+        list_share_out: wp.array(dtype=real),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        found = wp.int32(0)
+        use = vec3()
+        share = zero
+        for fiber in range(fiber_short.shape[0]):
+            share = wp.max(share, fiber_share[fiber])
+            found = wp.max(found, fiber_short[fiber])
+            use = wp.max(use, fiber_use[fiber])
+        list_short_out[0] = found
+        list_use_out[0] = use
+        list_share_out[0] = share
+
+    @wp.kernel(**options)
+    def foresee_list(
+        rejected: wp.array(dtype=wp.int32),
+        list_share: wp.array(dtype=real),
+        status: wp.array(dtype=wp.int32),
+        share_back: wp.array(dtype=real),
+        pairs_known: wp.array(dtype=wp.int32),
+    ):
+        """At the end of a step that is kept; `share_back` its share, 0 where the list is new.
+
+        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one,
+        unless the list is new by then.
+        """
+        if status[wp.static(HALT)] + rejected[0] != 0:
+            return
+        pairs_known[0] = 1
+        share = list_share[0]
+        foreseen = share + (share - share_back[0])
+        share_back[0] = share
+        if foreseen > one:
+            status[wp.static(EXPIRED)] = 1
+            share_back[0] = real(wp.static(FORESEEN))
+
+    names = ["bound_fibers", "bound_list", "foresee_list"]
+    if not native:  # vectors are no code for CUDA
+        return dict(zip(names, [bound_fibers, bound_list, foresee_list], strict=True))
+
     @wp.func_native(bound_text(name))
     def bound_block(
         first: wp.int32,
@@ -215,51 +265,4 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             share_out,
         )
 
-    @wp.kernel(**options)
-    def bound_list(
-        fiber_short: wp.array(dtype=wp.int32),
-        fiber_use: wp.array(dtype=vec3),
-        fiber_share: wp.array(dtype=real),
-        status: wp.array(dtype=wp.int32),
-        list_short_out: wp.array(dtype=wp.int32),
-        list_use_out: wp.array(dtype=vec3),
-        list_share_out: wp.array(dtype=real),
-    ):
-        if status[wp.static(HALT)] != 0:
-            return
-        found = wp.int32(0)
-        use = vec3()
-        share = zero
-        for fiber in range(fiber_short.shape[0]):
-            share = wp.max(share, fiber_share[fiber])
-            found = wp.max(found, fiber_short[fiber])
-            use = wp.max(use, fiber_use[fiber])
-        list_short_out[0] = found
-        list_use_out[0] = use
-        list_share_out[0] = share
-
-    @wp.kernel(**options)
-    def foresee_list(
-        rejected: wp.array(dtype=wp.int32),
-        list_share: wp.array(dtype=real),
-        status: wp.array(dtype=wp.int32),
-        share_back: wp.array(dtype=real),
-        pairs_known: wp.array(dtype=wp.int32),
-    ):
-        """At the end of a step that is kept; `share_back` its share, 0 where the list is new.
-
-        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one,
-        unless the list is new by then.
-        """
-        if status[wp.static(HALT)] + rejected[0] != 0:
-            return
-        pairs_known[0] = 1
-        share = list_share[0]
-        foreseen = share + (share - share_back[0])
-        share_back[0] = share
-        if foreseen > one:
-            status[wp.static(EXPIRED)] = 1
-            share_back[0] = real(wp.static(FORESEEN))
-
-    kernels = [native_bound if native else bound_fibers, bound_list, foresee_list]
-    return dict(zip(["bound_fibers", "bound_list", "foresee_list"], kernels, strict=True))
+    return dict(zip(names, [native_bound, bound_list, foresee_list], strict=True))
