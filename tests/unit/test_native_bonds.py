@@ -65,7 +65,7 @@ def after(sim: Simulation, launches: Iterable[Launch]) -> dict[str, np.ndarray]:
 
 def pair_arrays(method: Any) -> dict[str, np.ndarray]:
     """What the pair sweep stores."""
-    names = "acts force moment arms memory written".split()
+    names = "acts force arms memory written".split()
     return {name: getattr(method.contacts, name).numpy().copy() for name in names}
 
 
@@ -129,6 +129,7 @@ def test_same_as_plain(precision: str, turn: float, name: str) -> None:
     sim.prepare()
     native = sim.method.native  # type: ignore[attr-defined]
     assert native is not None
+    sim.method.contacts.allocate_scratch()  # type: ignore[attr-defined]
     plain_pairs = pair_launches(sim.method, sim.method.dt)  # type: ignore[arg-type]
     begun = [drift_launch(sim.method), native.launch(BEGIN | ALONE)]  # type: ignore[arg-type]
     plain, simd = (after(sim, [launch]) for launch in begun)
@@ -171,8 +172,7 @@ def check_pairs(sim: Simulation, precision: str) -> None:
     kept = "memory" if contacts.features.friction else "force"
     sides = [pairs[kept][..., touching, :] for pairs in (found, expected)]
     assert np.abs(sides[0] - sides[1]).max() < 10.0 * PAIR_BOUND[precision] * np.abs(sides[1]).max()
-    for name in ("force", "moment", "arms"):
-        # moments are in forces: those of a radius
+    for name in ("force", "arms"):
         scale = np.abs(expected["arms" if name == "arms" else "force"][touching]).max()
         error = np.abs(found[name][touching] - expected[name][touching]).max()
         # where they are goes with eps over the squared sine of the angle of two fibers
@@ -296,6 +296,16 @@ def test_flags() -> None:
     before = {name: array.numpy().copy() for name, array in arrays(sim).items()}
     for name, value in after(sim, [native.launch(LOADS | END | BEGIN)]).items():
         np.testing.assert_array_equal(value, before[name], name)
+
+
+def test_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What only the plain sweeps use is not there where vectors run."""
+    names = "moment bends beside hit_pair hit_closest hit_count acting node_force".split()
+    contacts = crowd().method.contacts  # type: ignore[attr-defined]
+    assert not any(hasattr(contacts, name) for name in names)
+    monkeypatch.setattr(bonded_spheres, "NATIVE", False)
+    contacts = crowd().method.contacts  # type: ignore[attr-defined]
+    assert all(hasattr(contacts, name) for name in names)
 
 
 def test_where_it_applies() -> None:

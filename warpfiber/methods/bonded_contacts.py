@@ -32,8 +32,10 @@ class BondedContacts:
         workers: int,
         stretch: float,
         pair_cost: float,
+        *,
+        vectors: bool,
     ) -> None:
-        self.model, self.state = model, state
+        self.model, self.state, self.vectors = model, state, vectors
         self.features = CapsuleFeatures(
             periodic=any(model.domain.periodic),
             dashpot=scene.contact.damping > 0.0,
@@ -53,10 +55,6 @@ class BondedContacts:
             workers=workers,
             pair_cost=pair_cost,
         )
-        p, device = model.precision, model.device
-        # scratch of the sweep over bonds, zero between steps
-        self.node_force = wp.zeros(model.node_count, dtype=p.vec3, device=device)
-        self.node_moment = wp.zeros(model.node_count, dtype=p.vec3, device=device)
         self._allocate()
 
     def _allocate(self) -> None:
@@ -65,15 +63,7 @@ class BondedContacts:
         self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
         self.push = wp.zeros(size, dtype=p.real, device=device)  # without dashpot
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
-        self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
-        self.bends = wp.zeros(size, dtype=wp.uint8, device=device)  # acts beside a contact
-        self.beside = wp.zeros(size, dtype=p.mat33, device=device)
-        self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
-        self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)
-        self.hit_count = wp.zeros(part_count(size, str(device)), dtype=wp.int32, device=device)
-        # pairs that act, packed by fiber: once as outgoing, once as incoming ones, and one ahead
-        self.acting = wp.zeros(2 * size + 1, dtype=wp.int32, device=device)
         kept = size if self.features.friction else 0
         self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
         self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)
@@ -82,6 +72,25 @@ class BondedContacts:
         self.kept += [wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2)]
         self.kept += [wp.zeros(size, dtype=kind, device=device) for kind in (p.vec3, p.vec4)]
         self.kept += [wp.zeros(kept, dtype=kind, device=device) for kind in (p.vec4, wp.int32)]
+
+        if not self.vectors:
+            self.allocate_scratch()
+
+    def allocate_scratch(self) -> None:
+        """What the plain sweeps hand from one to the next."""
+        p, device = self.model.precision, self.model.device
+        size, nodes = self.search.list.pair_capacity, self.model.node_count
+        self.moment = wp.zeros(size, dtype=p.vec3, device=device)
+        self.bends = wp.zeros(size, dtype=wp.uint8, device=device)  # acts beside a contact
+        self.beside = wp.zeros(size, dtype=p.mat33, device=device)
+        self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
+        self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)
+        self.hit_count = wp.zeros(part_count(size, str(device)), dtype=wp.int32, device=device)
+        # pairs that act, packed by fiber: once as outgoing, once as incoming ones, and one ahead
+        self.acting = wp.zeros(2 * size + 1, dtype=wp.int32, device=device)
+        # of the sweep over bonds, zero between steps
+        self.node_force = wp.zeros(nodes, dtype=p.vec3, device=device)
+        self.node_moment = wp.zeros(nodes, dtype=p.vec3, device=device)
 
     def kernels(self) -> list[Any]:
         """What a build launches."""

@@ -110,7 +110,13 @@ class BondedSpheres(Method):
         if self.features.pairs:
             stretch = float(self._segment_stretch().max())
             self.contacts = BondedContacts(
-                scene, model, state, self.workers, stretch, PAIR_COST if vectors else LISTED_COST
+                scene,
+                model,
+                state,
+                self.workers,
+                stretch,
+                PAIR_COST if vectors else LISTED_COST,
+                vectors=vectors,
             )
             self.list = self.contacts.search.list
             self.pair_features = self.contacts.measured

@@ -138,7 +138,6 @@ class NativeBonds:
             contacts.acts,
             contacts.push,
             contacts.force,
-            contacts.moment,
             contacts.arms,
             contacts.memory,
             contacts.written,

@@ -22,7 +22,7 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 ARRAYS = """
     groups fiber_group segment_fiber lattice out_start part_start near_count near_pair near_i near_j
     near_image pair_i pair_j pair_image place node_velocity node_spin step pair_acts pair_push
-    pair_force pair_moment pair_arms pair_memory pair_step contact_load contact_touch status
+    pair_force pair_arms pair_memory pair_step contact_load contact_touch status
 """.split()
 
 
@@ -62,7 +62,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_push: wp.array(dtype=real),
         pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
@@ -100,7 +99,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
-        pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
@@ -136,7 +134,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             pair_acts,
             pair_push_out,
             pair_force_out,
-            pair_moment_out,
             pair_arms_out,
             pair_memory,
             pair_step,

@@ -11,6 +11,7 @@ from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native import lane_types
+from warpfiber.passes.native_capsule_hits import MATTERS, SWEEP
 from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
 from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_source
 
@@ -135,20 +136,23 @@ _LAW = """
         const V arm_i = T(0.5) * (distance + radius_i - radius_j), arm_j = distance - arm_i;
         V size = force;
         V3 drag = same3(0, 0, 0);
-        T h_out[4][W];
+        T8 memories[W];
         if constexpr (HAS_DASHPOT || HAS_FRICTION) {
-            T4 r[W];
-            auto between = [&](const T* of, const int* node, V part) -> V3 {
-                for (int l = 0; l < W; ++l) r[l] = real_row(of, node[l]);
-                const V3 start = turn(r);
-                for (int l = 0; l < W; ++l) r[l] = real_row(of, node[l] + 1);
-                return start * (T(1) - part) + turn(r) * part;
-            };
-            const V3 vi = between((const T*)node_velocity, node_i, s);
-            const V3 vj = between((const T*)node_velocity, node_j, t);
-            const V3 wi = between((const T*)node_spin, node_i, s);
-            const V3 wj = between((const T*)node_spin, node_j, t);
-            const V3 slip = vi - vj + (wi * arm_i + wj * arm_j).cross(n);
+            // differences and sums before rows are turned: three of them instead of eight
+            T4 apart[W], rolled[W], spun[W];
+            for (int l = 0; l < W; ++l) {
+                const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
+                auto between = [&](const T* of, int node, T part) -> T4 {
+                    const T4 start = real_row(of, node);
+                    return start + (real_row(of, node + 1) - start) * part;
+                };
+                const T* const v = (const T*)node_velocity, * const w = (const T*)node_spin;
+                apart[l] = between(v, node_i[l], s_l) - between(v, node_j[l], t_l);
+                const T4 wi = between(w, node_i[l], s_l), wj = between(w, node_j[l], t_l);
+                rolled[l] = wi * ((const T*)&arm_i)[l] + wj * ((const T*)&arm_j)[l];
+                spun[l] = wi + wj;
+            }
+            const V3 slip = turn(apart) + turn(rolled).cross(n);
             const V approach = slip.dot(n);
             const V rest_s = T(1) - s, rest_t = T(1) - t;
             const V in_i = OF(pair_i, mass), in_j = OF(pair_j, mass);
@@ -165,10 +169,12 @@ _LAW = """
                 const V shear = OF(pair_i, shear_compliance) + OF(pair_j, shear_compliance);
                 const V k = T(4) * (compliance_i + compliance_j) / shear * stiffness;
                 const V3 slide = slip - n * approach;
-                const V turn = T(0.5) * dt * (wi + wj).dot(n);
+                const V twist = T(0.5) * dt * turn(spun).dot(n);
                 const V far_i = la * smaller(s, rest_s), far_j = lb * smaller(t, rest_t);
-                T kept[4][W];
+                T4 kept[W];
+                T before_of[W];
                 __builtin_memset(kept, 0, sizeof(kept));
+                __builtin_memset(before_of, 0, sizeof(before_of));
                 for (unsigned left = mine; left != 0; left &= left - 1) {
                     const int l = __builtin_ctz(left);
                     int from = ks[l];
@@ -183,12 +189,13 @@ _LAW = """
                             from, i + to_i, j + to_j, ((const T*)&far_i)[l], ((const T*)&far_j)[l]);
                         if (from < 0) continue;
                     }
-                    for (int m = 0; m < 4; ++m) kept[m][l] = kept_last[4L * from + m];
+                    __builtin_memcpy(&kept[l], kept_last + 4L * from, sizeof(T4));
+                    before_of[l] = kept_last[4L * from + 3];
                 }
-                const V3 h = {of(kept[0]), of(kept[1]), of(kept[2])};
-                const V before = of(kept[3]);
+                const V3 h = turn(kept);
+                const V before = of(before_of);
                 V3 flat = h - n * h.dot(n);
-                flat = flat + n.cross(flat) * turn;
+                flat = flat + n.cross(flat) * twist;
                 V scale = root(h.dot(h)) / larger(root(flat.dot(flat)), V(TINY));
                 scale = depth > before ? scale * root(before / depth) : scale;
                 scale = before > T(0) ? scale : V(T(0));
@@ -202,10 +209,8 @@ _LAW = """
                 const V back = T(-1) / k;
                 path = V3{slides ? drag.x * back : path.x, slides ? drag.y * back : path.y,
                           slides ? drag.z * back : path.z};
-                __builtin_memcpy(h_out[0], &path.x, sizeof(V));
-                __builtin_memcpy(h_out[1], &path.y, sizeof(V));
-                __builtin_memcpy(h_out[2], &path.z, sizeof(V));
-                __builtin_memcpy(h_out[3], &depth, sizeof(V));
+                const V numbers[8] = {path.x, path.y, path.z, depth, s, t, arm_i, arm_j};
+                turn_back(numbers, memories);
             }
         }
         const V3 whole = drag - n * size;
@@ -237,19 +242,15 @@ _LAW = """
             if (!(mine >> l & 1)) continue;
             const long k = ks[l];
             if constexpr (HAS_FRICTION) {
-                for (int p = 0; p < 4; ++p) kept_now[4 * k + p] = h_out[p][l];
+                __builtin_memcpy(kept_now + 4 * k, &memories[l], sizeof(T4));
                 written_now[k] = now;
             }
             if (keeps) {
                 pair_acts[k] = 1;
                 pair_push[k] = ((const T*)&force)[l];
                 T* f = (T*)pair_force + 3 * k;
-                T* m = (T*)pair_moment + 3 * k;
                 T* arms = (T*)pair_arms + 4 * k;
-                for (int c = 0; c < 3; ++c) {
-                    f[c] = ((const T*)(&whole.x + c))[l];
-                    m[c] = ((const T*)(&moment.x + c))[l];
-                }
+                for (int c = 0; c < 3; ++c) f[c] = ((const T*)(&whole.x + c))[l];
                 arms[0] = ((const T*)&s)[l];
                 arms[1] = ((const T*)&t)[l];
                 arms[2] = ((const T*)&arm_i)[l];
@@ -257,95 +258,6 @@ _LAW = """
             }
         }
     };
-"""
-
-_SWEEP = """
-    const int begin = out_start[part_start[part]], end = begin + near_count[part];
-    if (keeps) __builtin_memset(pair_acts + begin, 0, out_start[part_start[part + 1]] - begin);
-    struct Point { enum { HAS_LINE = false }; };
-    struct Line { enum { HAS_LINE = true }; };
-    constexpr int ROOM = 2 * W;
-    // pairs that may touch along a line lie behind those that touch at a point
-    int hit_at[2 * ROOM], points = 0, lines = 0;
-    T hit_s[2 * ROOM], hit_t[2 * ROOM];
-    auto run = [&](auto kind, int from, int& hits) {
-        law(kind, hit_at + from, hit_s + from, hit_t + from, W);
-        hits -= W;
-        for (int l = from; l < from + hits; ++l) {
-            hit_at[l] = hit_at[W + l];
-            hit_s[l] = hit_s[W + l];
-            hit_t[l] = hit_t[W + l];
-        }
-    };
-    auto run_rest = [&](auto kind, int from, int hits) {
-        if (hits == 0) return;
-        for (int l = from + hits; l < from + W; ++l) {
-            hit_at[l] = hit_at[from];
-            hit_s[l] = hit_s[from];
-            hit_t[l] = hit_t[from];
-        }
-        law(kind, hit_at + from, hit_s + from, hit_t + from, hits);
-    };
-    for (int first = begin; first < end; first += W) {
-        const int count = end - first < W ? end - first : W;
-        I code_i, code_j, images;
-        __builtin_memcpy(&code_i, near_i + first, sizeof(I));
-        __builtin_memcpy(&code_j, near_j + first, sizeof(I));
-        __builtin_memcpy(&images, near_image + first, sizeof(I));
-        const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
-        const int* const later = near_j + first + (is_large ? AHEAD : 1) * W;
-        for (int l = 0; l < W; ++l) {
-            const double* const x = (const double*)place + 3L * (later[l] >> TIP_BITS);
-            __builtin_prefetch(x);
-            if (is_large) __builtin_prefetch(x + 5);
-        }
-        V s, t, aa, bb, ab;
-        M aligned;
-        const V3 c = closest(
-            images, (const int*)&from_i, (const int*)&from_j, s, t, aligned, aa, bb, ab);
-        const V square = c.dot(c);
-        // At the far end of a segment that has a next one, that one has the contact; this one has
-        // at most saddles, and those only at nodes within a patch from which the distance falls.
-        const M on_i = ~tipped(code_i, 2), on_j = ~tipped(code_j, 2);
-        const V rest_s = T(1) - s, rest_t = T(1) - t;
-        const V wide = aa * bb - ab * ab;
-        const V most = (ROUNDED * largest_reach) * (largest_reach - root(square));
-        M idle = ~aligned & (((rest_s <= NEAR) & on_i) | ((rest_t <= NEAR) & on_j));
-        auto far = [&](V part, V other2) -> M {
-            return (part <= NEAR) | (part * part * wide > most * other2);
-        };
-        idle &= (far(s, bb) | tipped(code_i, 1)) & (far(rest_s, bb) | ~on_i);
-        idle &= (far(t, aa) | tipped(code_j, 1)) & (far(rest_t, aa) | ~on_j);
-        const M hit = (square < largest_reach * largest_reach) & ~idle;
-        const unsigned line = bits(aligned);
-        for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left);
-            const int slot = line >> l & 1 ? ROOM + lines++ : points++;
-            hit_at[slot] = first + l;
-            hit_s[slot] = ((const T*)&s)[l];
-            hit_t[slot] = ((const T*)&t)[l];
-            const long k = near_pair[first + l];
-            const long i = ((const int*)&from_i)[l], j = ((const int*)&from_j)[l];
-            if constexpr (HAS_DASHPOT || HAS_FRICTION) {
-                __builtin_prefetch((const T*)node_velocity + 3 * i);
-                __builtin_prefetch((const T*)node_velocity + 3 * j);
-                __builtin_prefetch((const T*)node_spin + 3 * i);
-                __builtin_prefetch((const T*)node_spin + 3 * j);
-            }
-            __builtin_prefetch(load + j, 1);
-            __builtin_prefetch(load + j + 1, 1);
-            if constexpr (HAS_FRICTION) {
-                __builtin_prefetch(written_last + k);
-                __builtin_prefetch(written_now + k, 1);
-                __builtin_prefetch(kept_last + 4 * k);
-                __builtin_prefetch(kept_now + 4 * k, 1);
-            }
-        }
-        if (points >= W) run(Point(), 0, points);
-        if (lines >= W) run(Line(), ROOM, lines);
-    }
-    run_rest(Point(), 0, points);
-    run_rest(Line(), ROOM, lines);
 """
 
 
@@ -379,7 +291,8 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     {_HAND_OVER}
     {DISTANCE}
     {law}
-    {_SWEEP}
+    {MATTERS}
+    {SWEEP}
     }};
     sweep();
     """
