@@ -217,8 +217,10 @@ def test_given_places_and_faults() -> None:
     with pytest.raises(SceneError, match="found a free place") as caught:
         place_fibers(bed(900, 26, shape))
     assert caught.value.faults[0].key == "fibers.0.count"
-    with pytest.raises(SceneError, match="not on nodes"):
+    with pytest.raises(SceneError, match="not on nodes; change segments to 24 or 28"):
         place_fibers(bed(1, 26, Shape(kind="z")))
+    with pytest.raises(SceneError, match="change segments to 4"):
+        place_fibers(bed(1, 2, Shape(kind="u", angle=90.0)))
 
 
 def test_check_tells_the_feret_diameter() -> None:

@@ -26,6 +26,7 @@ from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.host_writes import write_array
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.overlap_choice import OverlapChoice
 from warpfiber.passes.row_slip import Friction, RowSlip
@@ -200,6 +201,7 @@ class ImplicitContact:
             solves=self.solves,
             tears=self.packed,
             renews=self.choice is not None,
+            recalls=load is None,
         )
         self.shortest = 0.0
         self.no_need = wp.zeros(1, dtype=wp.int32, device=model.device)
@@ -261,8 +263,13 @@ class ImplicitContact:
             use[:2] *= 1.0 + 1.0 / max(1, step - self.search.skin.built_step)
         if not self.search.use_up(step, use):
             self._halve()
-        self.check.share_back.zero_()
+        write_array(self.check.share_back, 0.0)
+        self._forget_pairs()
         return self.search.refresh(step)
+
+    def _forget_pairs(self) -> None:
+        """Nothing is known yet of the pairs of a new list."""
+        write_array(self.solves[0][0].pairs_known, 0)
 
     def _halve(self) -> None:
         """Half the step, as no list lasts the whole; raises SceneError if none is worth taking."""
@@ -293,6 +300,7 @@ class ImplicitContact:
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
         """Take over what `saved` returned."""
         self.search.restore(arrays, step)
+        self._forget_pairs()
         self.check.share_back.assign(arrays["list_share"])
         for number, (rows, _) in enumerate(self.solves):
             head = f"rows{number}_"

@@ -27,8 +27,8 @@ from warpfiber.model import PAIR_COUNT, Model, State
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
 
-# as PAIR_COST: the rows and the check of an implicit step look at every listed pair
-STEP_PAIR_COST = 16.0
+# as PAIR_COST: an implicit step passes over most listed pairs, and looks at all of a new list
+STEP_PAIR_COST = 8.0
 PRUNED_FROM = 2000  # segments; pruning smaller lists costs its calls more than it saves
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.neighbors import NeighborList
+from warpfiber.passes.pair_motion import native_chunks
 from warpfiber.passes.unilateral import ContactDual
 
 CHUNKS = 128
@@ -37,6 +39,7 @@ class ContactCheck:
     `list_short` (1) int32: 1 if the list may miss a pair that is within its reach where the step
     would end; `list_use` (1) vec3: see `list_bound`.
     `renews`: the second of two solves is looked at by `launches_again`, where it moved anything.
+    `recalls`: the rows are made for where the step would end, which the list is asked for.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class ContactCheck:
         solves: Sequence[tuple[ContactRows, ContactDual]] = (),
         tears: bool = False,
         renews: bool = False,
+        recalls: bool = False,
     ) -> None:
         self.model, self.state, self.pairs = model, state, pairs
         self.solves, self.renews = solves, renews
@@ -60,6 +64,13 @@ class ContactCheck:
         domain, name = model.domain, model.precision.name
         none = wp.zeros(0, dtype=wp.uint8, device=model.device)
         self.fiber_frozen = none if fiber_frozen is None else fiber_frozen
+        reals = partial(wp.zeros, dtype=model.precision.real, device=model.device)
+        self.no_shift = reals(model.segment_count if len(solves) < 2 else 0)
+        # rows that are made for another motion learn nothing of this one
+        told = solves[0][0] if recalls else None
+        self.segment_moved = told.segment_moved if told else reals(model.segment_count)
+        self.step_strain = told.step_strain if told else reals(1)
+        self.pairs_known = told.pairs_known if told else self._int(1)
         features = CheckFeatures(
             any(domain.periodic),
             domain.wall,
@@ -75,7 +86,8 @@ class ContactCheck:
             second = dataclasses.replace(features, again=True, renewed=True)
             renewed = make_check_sweeps(name, second, kernel_module("check", name, second))
             self.kernels["check_again"] = renewed["check_segments"]
-        self.kernels |= make_list_bound(name, module)
+        self.native = model.device.startswith("cpu")
+        self.kernels |= make_list_bound(name, module, self.native)
         self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
         self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
@@ -86,12 +98,14 @@ class ContactCheck:
         self.crossed_at = self._int(chunks)
         self.largest = wp.zeros(1, dtype=wp.float64, device=model.device)
         self.found = self._int(5)
-        self.fiber_short = self._int(model.fiber_count)
+        # by runs of segments or by fibers
+        bounded = native_chunks(segments) if self.native else model.fiber_count
+        self.part_short = self._int(bounded)
         self.list_short = self._int(1)
         vec3, device = model.precision.vec3, model.device
-        self.fiber_use = wp.zeros(model.fiber_count, dtype=vec3, device=device)
+        self.part_use = wp.zeros(bounded, dtype=vec3, device=device)
         self.list_use = wp.zeros(1, dtype=vec3, device=device)
-        self.fiber_share = wp.zeros(model.fiber_count, dtype=model.precision.real, device=device)
+        self.part_share = wp.zeros(bounded, dtype=model.precision.real, device=device)
         self.list_share = wp.zeros(1, dtype=model.precision.real, device=device)
         self.share_back = wp.zeros(1, dtype=model.precision.real, device=device)
 
@@ -130,7 +144,7 @@ class ContactCheck:
             self.node_back,
             state.node_pos,
             self.solves[0][0].pair_clear if self.solves else self.overlap,
-            *([dual.segment_shift for _, dual in self.solves] + 2 * [self.overlap])[:2],
+            *self._shifts(),
             self.solves[1][0].row_count if self.renews else self.found,
             state.status,
             self.overlap,
@@ -151,6 +165,11 @@ class ContactCheck:
             self._launch("finish_check", 1, [*finish, state.status, self.largest, self.found]),
         ]
 
+    def _shifts(self) -> list[Any]:
+        """How far both solves moved each segment at most."""
+        shifts = [dual.segment_shift for _, dual in self.solves]
+        return (shifts + 2 * [self.no_shift])[:2]
+
     def list_launches(
         self, node_pos: Any, deformation: Any, flow_origin: np.ndarray
     ) -> list[Launch | Call]:
@@ -158,26 +177,33 @@ class ContactCheck:
         model, state = self.model, self.state
         bound = [
             model.precision.vec3(*flow_origin),
+            model.segment_count,
+            model.segment_node,
             self.pairs.skin_out,
             model.fiber_node_start,
+            state.deformation,
             deformation,
             state.list_pos,
+            self.node_back,
             node_pos,
+            *self._shifts(),
             state.status,
-            self.fiber_short,
-            self.fiber_use,
-            self.fiber_share,
+            self.step_strain,
+            self.segment_moved,
+            self.part_short,
+            self.part_use,
+            self.part_share,
         ]
-        reduced = [self.fiber_short, self.fiber_use, self.fiber_share, state.status]
+        reduced = [self.part_short, self.part_use, self.part_share, state.status]
         reduced += [self.list_short, self.list_use, self.list_share]
         return [
-            self._launch("bound_fibers", model.fiber_count, bound, split=True),
+            self._launch("bound_fibers", self.part_short.shape[0], bound, split=True),
             self._launch("bound_list", 1, reduced),
         ]
 
     def foresee(self, rejected: Any) -> Launch:
         """After the end of a step: whether the list would not last the next."""
-        inputs = [rejected, self.list_share, self.state.status, self.share_back]
+        inputs = [rejected, self.list_share, self.state.status, self.share_back, self.pairs_known]
         return self._launch("foresee_list", 1, inputs)
 
     def _launch(self, name: str, dim: int, inputs: list[Any], split: bool = False) -> Launch:

@@ -31,6 +31,7 @@ from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 NEVER = -1e20  # radii: no gap is that small
 GROWTH = 1.3
+FAR = 1e30  # run units: motion of which nothing is known
 
 
 class ContactRows:
@@ -95,6 +96,11 @@ class ContactRows:
         self.carried_start = self._int(segments + 1)
         self.segment_rows = self._int(segments)
         self.row_count, self.row_need = self._int(1), self._int(1)
+        # whether `pair_clear` is that of the last step, and what the next may take off it
+        self.pairs_known = self._int(1)
+        real = model.precision.real
+        self.step_strain = wp.zeros(1, dtype=real, device=model.device)
+        self.segment_moved = wp.full(segments, real(FAR), dtype=real, device=model.device)
         fiber = model.host["segment_fiber"]
         joined = np.concatenate([[False], fiber[1:] == fiber[:-1], [False]])
         ends = FIRST * ~joined[:-1] + LAST * ~joined[1:]
@@ -168,6 +174,7 @@ class ContactRows:
             self.state.status,
             self.row_count,
             self.row_need,
+            self.pairs_known,
         ]
         rub = self.rub
         return [
@@ -204,6 +211,9 @@ class ContactRows:
             *self._looks(),
             model.segment_fiber,
             self.segment_ends,
+            self.pairs_known,
+            self.step_strain,
+            self.segment_moved,
             pair_clear,
             self.pair_slots,
         ]

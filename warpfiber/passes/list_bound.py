@@ -6,9 +6,13 @@ Source: a segment as listed, carried by the flow since the build: the line from 
     while 2 u + (1 - sigma_min(F)) h_list <= skin. What slides along itself, as rigid fibers do in a
     flow that would stretch them, uses up the extension first. A list whose use, growing as in the
     last step, would be too much in the next one is built before that, not after it has failed.
+    Beside it, how far each segment may have moved off the flow since the start of the last step:
+    with it a pair that was apart by d then stays apart by (1 - s) d - m_i - m_j (`pair_motion`).
 Symbols: F deformation since the build, sigma_min its smallest singular value, h_list reach + skin,
     x_o origin of the flow; `use` of a list: farthest sliding and distance from the lines without
-    end, and the largest u allowed; `share` its largest u over that.
+    end, and the largest u allowed; `share` its largest u over that. m_i motion of segment i beside
+    that of the flow in a step, and what contact moved it in the step before; s largest strain of
+    the flow in a step, as a bound of 1 - sigma_min.
 """
 
 from functools import cache
@@ -16,21 +20,26 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import EXPIRED, HALT, precision
+from warpfiber.passes.native_list_bound import bound_text
+from warpfiber.passes.pair_motion import CHUNK_SEGMENTS
 
 FORESEEN = 2.0  # in place of a share, of which none that is kept is above 1
 
 
 @cache
-def make_list_bound(name: str, module: str = "unique"):
-    """`bound_fibers`, `bound_list`, `foresee_list` in launch order, as a dict by name."""
+def make_list_bound(name: str, module: str = "unique", native: bool = False):
+    """`bound_fibers`, `bound_list`, `foresee_list` in launch order, as a dict by name.
+
+    `native`: the first over runs of CHUNK_SEGMENTS segments, for the CPU.
+    """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     zero, half, one = real(0.0), real(0.5), real(1.0)
     options = {"module": module, "enable_backward": False, "grid_stride": False}
 
     @wp.func
-    def farthest_motion(affine: mat33, sizes: wp.array(dtype=real)) -> real:
-        """Largest |u| allowed: 1 - sigma_min is at most the largest row sum of |sym(F - I)|."""
+    def largest_strain(affine: mat33) -> real:
+        """1 - sigma_min is at most the largest row sum of |sym(F - I)|."""
         stretch = zero
         for row in range(3):
             norm = zero
@@ -40,18 +49,36 @@ def make_list_bound(name: str, module: str = "unique"):
                     entry -= real(1.0)
                 norm += wp.abs(entry)
             stretch = wp.max(stretch, norm)
-        return half * (sizes[1] - stretch * sizes[0])
+        return stretch
+
+    @wp.func
+    def farthest_motion(affine: mat33, sizes: wp.array(dtype=real)) -> real:
+        """Largest |u| allowed."""
+        return half * (sizes[1] - largest_strain(affine) * sizes[0])
+
+    @wp.func
+    def step_push(before: wp.array(dtype=wp.mat33d), after: wp.array(dtype=wp.mat33d)) -> mat33:
+        """F of the step alone."""
+        return mat33(after[0] * wp.inverse(before[0]))
 
     @wp.kernel(**options)
     def bound_fibers(
         offset: wp.int32,
         flow_origin: vec3,
+        segments: wp.int32,
+        segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
+        deformation_back: wp.array(dtype=wp.mat33d),
         deformation: wp.array(dtype=wp.mat33d),
         list_pos: wp.array(dtype=vec3),
+        node_back: wp.array(dtype=vec3),
         node_pos: wp.array(dtype=vec3),
+        segment_shift: wp.array(dtype=real),
+        shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
+        step_strain_out: wp.array(dtype=real),
+        segment_moved_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
         use_out: wp.array(dtype=vec3),
         share_out: wp.array(dtype=real),
@@ -61,6 +88,9 @@ def make_list_bound(name: str, module: str = "unique"):
         fiber = wp.tid() + offset
         affine = mat33(deformation[0])
         limit = farthest_motion(affine, list_sizes)
+        push = step_push(deformation_back, deformation)
+        if fiber == 0:
+            step_strain_out[0] = largest_strain(push)
         found = wp.int32(0)
         slid = zero
         across = zero
@@ -72,6 +102,7 @@ def make_list_bound(name: str, module: str = "unique"):
             start = flow_origin + affine * (list_pos[i] - flow_origin)
             axis = affine * listed
             inverse = one / wp.dot(axis, axis)
+            moved2 = zero
             for end in range(2):
                 apart = node_pos[i + end] - start
                 s = wp.dot(apart, axis) * inverse
@@ -82,11 +113,88 @@ def make_list_bound(name: str, module: str = "unique"):
                 most = wp.max(most, off)
                 slid = wp.max(slid, wp.max(-s, s - one) * length)
                 across = wp.max(across, wp.length_sq(apart - s * axis))
+                carried = push * (node_back[i + end] - flow_origin)
+                moved2 = wp.max(moved2, wp.length_sq(node_pos[i + end] - flow_origin - carried))
+            s_at = i - fiber
+            segment_moved_out[s_at] = wp.sqrt(moved2) + segment_shift[s_at] + shift_again[s_at]
         if limit < zero:
             found = 1
         short_out[fiber] = found
         use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
         share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
+
+    @wp.func_native(bound_text(name))
+    def bound_block(
+        first: wp.int32,
+        last: wp.int32,
+        at_out: wp.int32,
+        flow_origin: vec3,
+        affine: mat33,
+        push: mat33,
+        limit: real,
+        extension: real,
+        segment_node: wp.array(dtype=wp.int32),
+        list_pos: wp.array(dtype=vec3),
+        node_back: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        segment_shift: wp.array(dtype=real),
+        shift_again: wp.array(dtype=real),
+        segment_moved: wp.array(dtype=real),
+        short_out: wp.array(dtype=wp.int32),
+        use_out: wp.array(dtype=vec3),
+        share_out: wp.array(dtype=real),
+    ): ...
+
+    @wp.kernel(**options)
+    def native_bound(
+        offset: wp.int32,
+        flow_origin: vec3,
+        segments: wp.int32,
+        segment_node: wp.array(dtype=wp.int32),
+        list_sizes: wp.array(dtype=real),
+        fiber_node_start: wp.array(dtype=wp.int32),
+        deformation_back: wp.array(dtype=wp.mat33d),
+        deformation: wp.array(dtype=wp.mat33d),
+        list_pos: wp.array(dtype=vec3),
+        node_back: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        segment_shift: wp.array(dtype=real),
+        shift_again: wp.array(dtype=real),
+        status: wp.array(dtype=wp.int32),
+        step_strain_out: wp.array(dtype=real),
+        segment_moved_out: wp.array(dtype=real),
+        short_out: wp.array(dtype=wp.int32),
+        use_out: wp.array(dtype=vec3),
+        share_out: wp.array(dtype=real),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        chunk = wp.tid() + offset
+        first = chunk * wp.static(CHUNK_SEGMENTS)
+        affine = mat33(deformation[0])
+        push = step_push(deformation_back, deformation)
+        if chunk == 0:
+            step_strain_out[0] = largest_strain(push)
+        bound_block(
+            first,
+            wp.min(first + wp.static(CHUNK_SEGMENTS), segments),
+            chunk,
+            flow_origin,
+            affine,
+            push,
+            farthest_motion(affine, list_sizes),
+            list_sizes[2],
+            segment_node,
+            list_pos,
+            node_back,
+            node_pos,
+            segment_shift,
+            shift_again,
+            segment_moved_out,
+            short_out,
+            use_out,
+            share_out,
+        )
 
     @wp.kernel(**options)
     def bound_list(
@@ -117,10 +225,15 @@ def make_list_bound(name: str, module: str = "unique"):
         list_share: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
         share_back: wp.array(dtype=real),
+        pairs_known: wp.array(dtype=wp.int32),
     ):
-        """At the end of a step that is kept; `share_back` its share, 0 where the list is new."""
+        """At the end of a step that is kept; `share_back` its share, 0 where the list is new.
+
+        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one.
+        """
         if status[wp.static(HALT)] + rejected[0] != 0:
             return
+        pairs_known[0] = 1
         share = list_share[0]
         foreseen = share + (share - share_back[0])
         share_back[0] = share
@@ -128,5 +241,5 @@ def make_list_bound(name: str, module: str = "unique"):
             status[wp.static(EXPIRED)] = 1
             share_back[0] = real(wp.static(FORESEEN))
 
-    kernels = [bound_fibers, bound_list, foresee_list]
+    kernels = [native_bound if native else bound_fibers, bound_list, foresee_list]
     return dict(zip(["bound_fibers", "bound_list", "foresee_list"], kernels, strict=True))

@@ -193,6 +193,7 @@ _FORCES = """
     V inverse0 = V(T(0));
     M torn = V(T(1)) < T(0);
     for (int k = 0; k < segments; ++k) {
+        ask(k, node_pos, node_velocity);
         const V3 x1 = get(x, k + 1), v1 = get(v, k + 1);
         const V3 edge = x1 - x0;
         const V d1 = __builtin_elementwise_sqrt(edge.dot(edge));
@@ -258,6 +259,7 @@ _STEP = """
         load(p, (const T*)list_pos);
     }
     for (int k = segments; k >= 0; --k) {
+        if constexpr (HAS_PAIRS) ask(k, list_pos);
         V3 here = get(x, k), speed = get(v, k), force = get(f, k);
         if constexpr (IS_CONSISTENT) {
             if (k < segments) force = force - y * V(g.coupling * pivot[k]);
@@ -296,40 +298,20 @@ _STEP = """
     store((T*)node_velocity, v, keep);
 """
 
-# Fibers that a cache does not hold are asked for one block ahead: rows of many fibers at once are
-# more streams than the processor follows by itself.
-_PREFETCH = """
-    if (node_count > fetch_from && block + 1 < block_count) {
-        const int* ahead = fiber + W;
-        for (int l = 0; l < W; ++l) {
-            const long begin = 3L * fiber_node_start[ahead[l]];
-            const long end = 3L * fiber_node_start[ahead[l] + 1];
-            constexpr int line = 64 / sizeof(T);
-            for (long at = begin; at < end + line; at += line) {
-                __builtin_prefetch((const T*)node_pos + at, 1);
-                __builtin_prefetch((const T*)node_velocity + at, 1);
-                if constexpr (HAS_PAIRS) __builtin_prefetch((const T*)list_pos + at);
-            }
-            if constexpr (HAS_PAIRS) {
-                const int segment = fiber_node_start[ahead[l]] - ahead[l];
-                const int segment_end = fiber_node_start[ahead[l] + 1] - ahead[l] - 1;
-                const int out_end = out_start[segment_end];
-                for (int k = out_start[segment]; k < out_end; ++k)
-                    if (pair_acts[k]) {
-                        __builtin_prefetch((const T*)pair_force + 3 * (long)k);
-                        __builtin_prefetch((const T*)pair_closest + 2 * (long)k);
-                    }
-                const int in_end = in_start[segment_end];
-                for (int slot = in_start[segment]; slot < in_end; ++slot) {
-                    const int k = in_pair[slot];
-                    if (pair_acts[k]) {
-                        __builtin_prefetch((const T*)pair_force + 3 * (long)k);
-                        __builtin_prefetch((const T*)pair_closest + 2 * (long)k);
-                    }
-                }
-            }
-        }
-    }
+# Fibers that a cache does not hold are asked for one block ahead, a cache line of each at a time
+# along the walks: all at once would be more requests than the processor keeps. Into the second
+# cache, whose room they are; the first one would stand still when requests are many.
+_COMING = """
+    constexpr int LINE = 64 / sizeof(T);
+    const bool asks = node_count > fetch_from && block + 1 < block_count;
+    long coming[W];
+    for (int l = 0; l < W; ++l) coming[l] = asks ? 3L * fiber_node_start[fiber[W + l]] : 0;
+    const int lines = asks ? size / LINE + 2 : 0;  // that the numbers of a fiber may touch
+    auto ask = [&](int k, auto... arrays) {
+        if (k < lines)
+            for (int l = 0; l < W; ++l)
+                (__builtin_prefetch((const T*)arrays + coming[l] + LINE * k, 0, 2), ...);
+    };
 """
 
 _SWEEP = (
@@ -343,7 +325,7 @@ _SWEEP = (
     int first[W];
     for (int l = 0; l < W; ++l) first[l] = fiber_node_start[fiber[l]];
 """
-    + _PREFETCH
+    + _COMING
     + """
     const int room = size < W ? W : size;  // a square always fits
     V* x = (V*)__builtin_alloca_with_align(4 * room * sizeof(V), 8 * sizeof(V));

@@ -38,6 +38,7 @@ from warpfiber.passes.cells import (
     make_cell_kernels,
 )
 from warpfiber.passes.executor import Executor
+from warpfiber.passes.host_writes import write_array
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_launches import list_launches
 from warpfiber.passes.native_search import make_search_kernels
@@ -191,9 +192,9 @@ class NeighborList:
     def _write_sizes(self) -> None:
         extent, extension = self.reach + self.skin + self.margin, self.extension
         longest = self.stretch_allowed * self.longest_piece + 2.0 * extension / self.fewest_pieces
-        self.sizes.assign(np.asarray([extent, longest, extension]))
+        write_array(self.sizes, np.asarray([extent, longest, extension]))
         told = np.asarray([self.reach + self.skin, self.skin, extension])
-        self.skin_out.assign(told.astype(self.model.precision.numpy))
+        write_array(self.skin_out, told.astype(self.model.precision.numpy))
         if self.pruning is not None:
             self.pruning.write_sizes()
 

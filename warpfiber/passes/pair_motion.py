@@ -6,7 +6,10 @@ decide is marked LOOK, elsewhere every pair that does not stay apart is.
 
 Source: no two points of two segments approach each other by more than the largest relative motion
     of their ends, so the center lines stay apart by `clear` = distance at the start - that motion.
-    Contact moves the fibers further, which a check adds.
+    The flow brings them nearer by no more than (1 - s), the rest of their motion by m_i + m_j.
+    Contact moves the fibers further, which a check adds. Where `clear` of the last step is known,
+    that of the next is at least (1 - s) clear - m_i - m_j, and only where that is little is it
+    measured.
 Symbols: as in `row_geometry`: D, a, b at the start, w, wa, wb the motion of the step, an image with
     its box vector at both times.
 """
@@ -24,6 +27,7 @@ from warpfiber.passes.portions import portioned
 from warpfiber.passes.row_geometry import PARALLEL, make_closest_points, make_row_geometry
 
 AHEAD = 32  # pairs whose nodes are fetched
+STRETCH = 512  # pairs of which the near ones are picked at a time
 CHUNK_SEGMENTS = 64  # per launch index on the CPU: workers share pairs in such portions
 
 # Rows (x, y, z, unused) of a pair as they lie in memory, then transposed to a vector per component;
@@ -101,27 +105,47 @@ BLOCK = """
     };
 SLOTS
     int waiting[2 * W], held = 0;
-    for (int k = first; k < last; k += W) {
+    // pairs that may have come near since, in order, a stretch of the list at a time
+    int near[STRETCH + W];
+    const T kept = T(1) - step_strain.data[0];
+    const bool known = pairs_known.data[0] != 0;
+    for (int begin = first; begin < last; begin += STRETCH) {
+    const int end = begin + STRETCH < last ? begin + STRETCH : last;
+    int count = 0;
+    for (int k = begin; k < end; ++k) {
+        near[count] = k;
+        const T clear = kept * pair_clear.data[k]
+            - segment_moved.data[pair_i.data[k]] - segment_moved.data[pair_j.data[k]];
+        const bool far = known & (clear > looked_at);
+        pair_clear.data[k] = clear;
+        pair_slots.data[k] = 0;
+        count += far ? 0 : 1;
+    }
+    for (int n = 0; n < W; ++n) near[count + n] = count > 0 ? near[count - 1] : begin;
+    for (int k = 0; k < count; k += W) {
         // partners are anywhere in memory
-        for (int ahead = k + AHEAD; ahead < k + AHEAD + W && ahead < last; ++ahead) {
-            const long long j = 3ll * segment_node.data[pair_j.data[ahead]];
+        for (int ahead = k + AHEAD; ahead < k + AHEAD + W && ahead < count; ++ahead) {
+            const long long j = 3ll * segment_node.data[pair_j.data[near[ahead]]];
             __builtin_prefetch(back + j);
             __builtin_prefetch(back + j + 5);
             __builtin_prefetch(now + j);
             __builtin_prefetch(now + j + 5);
         }
-        int pairs[W];
-        for (int l = 0; l < W; ++l) pairs[l] = k + l < last ? k + l : last - 1;
+        const int* const pairs = near + k;
         const Motion m = motion_of(pairs);
         const V aa = larger(m.a.dot(m.a), least), bb = larger(m.b.dot(m.b), least);
         const Place at = closest(m, aa, bb);
         const V3 c = m.d + m.b * at.t - m.a * at.s, u = m.w - m.wa, v = m.w + m.wb, both = v - m.wa;
         const V most = larger(larger(m.w.dot(m.w), u.dot(u)), larger(v.dot(v), both.dot(both)));
-        const V clear = __builtin_elementwise_sqrt(c.dot(c)) - __builtin_elementwise_sqrt(most);
-        for (int l = 0; l < W && k + l < last; ++l) {
-            pair_clear.data[k + l] = clear[l];
-            pair_slots.data[k + l] = 0;
-            waiting[held] = k + l;
+        V off_flow;
+        for (int l = 0; l < W; ++l)
+            off_flow[l] = segment_moved.data[pair_i.data[pairs[l]]]
+                + segment_moved.data[pair_j.data[pairs[l]]];
+        const V apart = __builtin_elementwise_sqrt(c.dot(c));
+        const V clear = larger(apart - __builtin_elementwise_sqrt(most), kept * apart - off_flow);
+        for (int l = 0; l < W && k + l < count; ++l) {
+            pair_clear.data[pairs[l]] = clear[l];
+            waiting[held] = pairs[l];
             held += clear[l] > looked_at ? 0 : 1;
         }
         if (held >= W) {
@@ -129,6 +153,7 @@ SLOTS
             held -= W;
             for (int l = 0; l < held; ++l) waiting[l] = waiting[W + l];
         }
+    }
     }
     if (held > 0) {
         for (int l = held; l < W; ++l) waiting[l] = waiting[held - 1];
@@ -179,6 +204,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         settles: wp.int32,
         segment_fiber: wp.array(dtype=wp.int32),
         segment_ends: wp.array(dtype=wp.uint8),
+        pairs_known: wp.array(dtype=wp.int32),
+        step_strain: wp.array(dtype=real),
+        segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
     ):
@@ -190,7 +218,14 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         a = node_back[node_i + 1] - xi
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
+        stays = real(1.0) - step_strain[0]
         for k in range(out_start[i], out_start[i + 1]):
+            if pairs_known[0] != 0:
+                least = stays * pair_clear[k] - segment_moved[i] - segment_moved[pair_j[k]]
+                if least > looked_at:
+                    pair_clear[k] = least
+                    pair_slots[k] = wp.uint8(0)
+                    continue
             node_j = segment_node[pair_j[k]]
             xj = node_back[node_j]
             b = node_back[node_j + 1] - xj
@@ -203,7 +238,8 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             wb = node_pos[node_j + 1] - node_back[node_j + 1] - move_j
             st = closest_points(delta, a, b)
             distance = wp.length(delta + st[1] * b - st[0] * a)
-            clear = distance - largest_motion(w, wa, wb)
+            off_flow = segment_moved[i] + segment_moved[pair_j[k]]
+            clear = wp.max(distance - largest_motion(w, wa, wb), stays * distance - off_flow)
             pair_clear[k] = clear
             pair_slots[k] = wp.uint8(wp.where(clear > looked_at, 0, wp.static(LOOK)))
 
@@ -216,6 +252,7 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         "HALF": 1 << (IMAGE_BITS - 1),
         "BITS": IMAGE_BITS,
         "AHEAD": AHEAD,
+        "STRETCH": STRETCH,
         "PERIODIC": str(periodic).lower(),
         "NONE": NO_IMAGE,
         "PARALLEL": repr(PARALLEL),
@@ -242,6 +279,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         settles: wp.int32,
         segment_fiber: wp.array(dtype=wp.int32),
         segment_ends: wp.array(dtype=wp.uint8),
+        pairs_known: wp.array(dtype=wp.int32),
+        step_strain: wp.array(dtype=real),
+        segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
     ): ...
@@ -268,6 +308,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         settles: wp.int32,
         segment_fiber: wp.array(dtype=wp.int32),
         segment_ends: wp.array(dtype=wp.uint8),
+        pairs_known: wp.array(dtype=wp.int32),
+        step_strain: wp.array(dtype=real),
+        segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
     ):
@@ -294,6 +337,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             settles,
             segment_fiber,
             segment_ends,
+            pairs_known,
+            step_strain,
+            segment_moved,
             pair_clear,
             pair_slots,
         )

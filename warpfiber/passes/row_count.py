@@ -288,10 +288,15 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         status: wp.array(dtype=wp.int32),
         row_count_out: wp.array(dtype=wp.int32),
         row_need_out: wp.array(dtype=wp.int32),
+        pairs_known_out: wp.array(dtype=wp.int32),
     ):
-        """Rows that there are; none, and how many are needed, if they do not fit."""
+        """Rows that there are; none, and how many are needed, if they do not fit.
+
+        What is known of the pairs is of the end of the step now, which may be taken back.
+        """
         if status[wp.static(HALT)] != 0:
             return
+        pairs_known_out[0] = 0
         total = row_out_start[segments]
         row_need_out[0] = 0
         if total > capacity:

@@ -90,12 +90,26 @@ def _chords(shape: Shape, step: float, segments: int) -> Floats:
         if abs(asked - total) > LENGTH_SPREAD * total:
             raise ValueError(f"middle + 2 tip is {asked:.6g} m, the centerline {total:.6g} m long")
         tip *= total / asked
-    count = tip / step
-    if abs(count - round(count)) > ON_NODE * segments or round(count) < 1:
+    if not _on_node(tip / total, segments):
         raise ValueError(
-            f"its corners lie {count:.4g} segments from the ends, not on nodes; change segments"
+            f"its corners lie {tip / step:.4g} segments from the ends, not on nodes; "
+            f"change segments{_nearest(tip / total, segments)}"
         )
-    return _bent(round(count), segments, corner1, corner2, dihedral) * step
+    return _bent(round(tip / step), segments, corner1, corner2, dihedral) * step
+
+
+def _on_node(part: float, segments: int) -> bool:
+    """Whether this part of the centerline is a whole number of segments, one at least."""
+    count = part * segments
+    return abs(count - round(count)) <= ON_NODE * segments and round(count) >= 1
+
+
+def _nearest(part: float, segments: int) -> str:
+    """The next smaller and larger numbers of segments with a node at this part, as a remedy."""
+    below = next((n for n in range(segments - 1, 1, -1) if _on_node(part, n)), None)
+    above = next((n for n in range(segments + 1, 2 * segments + 5) if _on_node(part, n)), None)
+    named = " or ".join(str(n) for n in (below, above) if n is not None)
+    return f" to {named}" if named else ""
 
 
 def _bent(tip: int, segments: int, corner1: float, corner2: float, dihedral: float) -> Floats:
