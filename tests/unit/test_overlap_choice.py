@@ -1,7 +1,7 @@
 """A second solve for fibers that the first left overlapping: which, what it does, what it checks.
 
-Tolerance: marks are exact; overlaps that a check looks at again are those of a check of all pairs,
-to the last bit.
+Tolerance: marks are exact; overlaps that a check looks at again are those of a check of all pairs
+but for rounding, which vectors do in another order: 1e-12, some ten operations on lengths of 100.
 """
 
 from __future__ import annotations
@@ -147,10 +147,10 @@ def test_check_of_what_moved_again_sees_the_same() -> None:
         executor = Executor(whole.launches(), "cpu")
         executor.run(1, lambda: False)
         executor.close()
-        assert check.largest.numpy()[0] == whole.largest.numpy()[0]
+        assert abs(check.largest.numpy()[0] - whole.largest.numpy()[0]) < 1e-12
         assert (check.crossed.numpy() == whole.crossed.numpy()).all()
-        kept = check.overlap.numpy()
-        assert (kept[kept > 0.0] == whole.overlap.numpy()[kept > 0.0]).all()
+        kept, all_pairs = check.overlap.numpy(), whole.overlap.numpy()
+        assert np.abs(kept - all_pairs)[kept > 0.0].max(initial=0.0) < 1e-12
         again += int(contact.solves[1][0].row_count.numpy()[0]) > 0
     assert again > 3
     sim.close()

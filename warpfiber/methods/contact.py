@@ -26,7 +26,7 @@ from warpfiber.model import EXPIRED, HALT, Model, State
 from warpfiber.passes.contact_check import ContactCheck
 from warpfiber.passes.contact_rows import NEVER, ContactRows
 from warpfiber.passes.executor import Call, Launch, Repeat
-from warpfiber.passes.host_writes import write_array
+from warpfiber.passes.host_arrays import host_view, write_array
 from warpfiber.passes.list_bound import FORESEEN
 from warpfiber.passes.overlap_choice import OverlapChoice
 from warpfiber.passes.row_slip import Friction, RowSlip
@@ -147,6 +147,7 @@ class ImplicitContact:
             stretch=stretch,
             workers=workers,
             most_skin=SKIN_BENT if self.packed else MOST_SKIN,
+            slides=not self.packed,  # whose second solve has rows of walls for what is listed
         )
         rub = None
         if self.hard and (scene.contact.friction > 0.0 or scene.contact.wall_friction > 0.0):
@@ -258,18 +259,13 @@ class ImplicitContact:
             words[[EXPIRED, HALT]] = 0
             self.state.status.assign(words)
             return True
-        use = self.check.list_use.numpy()[0].copy()
-        if self.check.share_back.numpy()[0] == FORESEEN:  # what the next step would have found
+        use = host_view(self.check.list_use)[0].copy()
+        if host_view(self.check.share_back)[0] == FORESEEN:  # what the next step would have found
             use[:2] *= 1.0 + 1.0 / max(1, step - self.search.skin.built_step)
         if not self.search.use_up(step, use):
             self._halve()
         write_array(self.check.share_back, 0.0)
-        self._forget_pairs()
         return self.search.refresh(step)
-
-    def _forget_pairs(self) -> None:
-        """Nothing is known yet of the pairs of a new list."""
-        write_array(self.solves[0][0].pairs_known, 0)
 
     def _halve(self) -> None:
         """Half the step, as no list lasts the whole; raises SceneError if none is worth taking."""
@@ -300,7 +296,7 @@ class ImplicitContact:
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> None:
         """Take over what `saved` returned."""
         self.search.restore(arrays, step)
-        self._forget_pairs()
+        write_array(self.check.pairs_known, 0)
         self.check.share_back.assign(arrays["list_share"])
         for number, (rows, _) in enumerate(self.solves):
             head = f"rows{number}_"

@@ -24,6 +24,7 @@ from warpfiber.methods.skin import (
     SkinChoice,
 )
 from warpfiber.model import PAIR_COUNT, Model, State
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.scene import Scene
 
@@ -32,6 +33,7 @@ STEP_PAIR_COST = 8.0
 PRUNED_FROM = 2000  # segments; pruning smaller lists costs its calls more than it saves
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1
+MEAN_SLIDE = 0.4  # of the farthest; where each segment has an extension of its own
 
 
 class PairSearch:
@@ -39,7 +41,8 @@ class PairSearch:
 
     `reach`: distance of center lines up to which pairs are listed beside the skin; `pair_cost`:
     of one more listed pair, see `skin.PAIR_COST`; `most_skin`: the largest skin, diameters;
-    `prunes`: whether the list may be pruned from a wider one.
+    `prunes`: whether the list may be pruned from a wider one; `slides`: whether segments are listed
+    as much longer as each of them slides along itself.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class PairSearch:
         pair_cost: float = STEP_PAIR_COST,
         most_skin: float = MOST_SKIN,
         prunes: bool = False,
+        slides: bool = False,
     ) -> None:
         self.most_skin = most_skin
         self.scene, self.model, self.state = scene, model, state
@@ -79,6 +83,7 @@ class PairSearch:
             workers=workers,
             native=native,
             flow_origin=origin if prunes else None,
+            slide_origin=origin if slides else None,
         )
         self.lasting = lasting_height(scene) / model.units.length
         self.skin = self._skin_choice(skin)
@@ -150,7 +155,8 @@ class PairSearch:
 
     def set_extension(self, extension: float) -> None:
         """Another extension of listed segments, from the next list on."""
-        self.skin.length += 2.0 * (extension - self.list.extension)
+        share = 1.0 if self.list.slide_origin is None else MEAN_SLIDE
+        self.skin.length += 2.0 * share * (extension - self.list.extension)
         if extension != self.list.extension:
             self.list.set_extension(extension)
 
@@ -165,7 +171,7 @@ class PairSearch:
 
     def choose_skin(self, step: int, used: float | None = None) -> None:
         """Another skin, the present one being used up; `used` of it per step, if that is known."""
-        listed = float(self.state.status.numpy()[PAIR_COUNT]) / self.model.segment_count
+        listed = float(host_view(self.state.status)[PAIR_COUNT]) / self.model.segment_count
         skin = self.skin.choose(step, listed, used)
         self.set_skin(skin, self.skin.choose_margin(skin, listed))
 
@@ -193,9 +199,12 @@ class PairSearch:
 
     def _share(self, use: np.ndarray | None) -> float:
         """Part of the skin that motion across the segments used up; 0 if that is not known."""
-        if use is None or not np.isfinite(use).all() or use[2] <= 0.0:
+        if use is None:
             return 0.0
-        return float(use[1] / use[2])
+        slid, across, limit = (float(value) for value in use)
+        if not math.isfinite(slid + across + limit) or limit <= 0.0:
+            return 0.0
+        return across / limit
 
     def prune(self, step: int) -> bool:
         """Prune the wide list anew, the present one being used up; False if a build is due."""
@@ -257,6 +266,8 @@ class PairSearch:
         extension = np.asarray(self.list.extension)
         known = {"stretch_allowed": allowed, "extension": extension, "skin": self.skin.saved()}
         pruning = self.list.pruning
+        if self.list.slide_origin is not None:
+            known["segment_extension"] = self.list.segment_extension.numpy().copy()
         return known | (pruning.saved() if pruning is not None else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], step: int) -> bool:
@@ -266,6 +277,8 @@ class PairSearch:
         self.set_stretch(float(arrays["stretch_allowed"]))
         self.set_skin(float(saved[0]), float(saved[4]) if pruning is not None else None)
         self.set_extension(float(arrays["extension"]))
+        if self.list.slide_origin is not None:
+            self.list.segment_extension.assign(arrays["segment_extension"])
         self.skin.begun = step
         head = "list" if pruning is None else "wide"
         state.node_pos.assign(arrays[f"{head}_pos"])

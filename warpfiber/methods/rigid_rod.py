@@ -22,7 +22,13 @@ from warpfiber.methods.loads import node_loads
 from warpfiber.model import Model, State
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.kernel_module import kernel_module
-from warpfiber.passes.rigid_rods import make_rod_maps, make_rod_step, rod_map
+from warpfiber.passes.rigid_rods import (
+    CHUNK,
+    make_native_rod_step,
+    make_rod_maps,
+    make_rod_step,
+    rod_map,
+)
 from warpfiber.passes.rod_response import RodResponse
 from warpfiber.scene import Fault, Scene, SceneError
 
@@ -86,6 +92,11 @@ class RigidRod(Implicit):
             state.status,
         ]
         loaded = self.node_load.shape[0] > 0
+        alike = len(model.group_rows) == 1 and not loaded
+        if alike and model.device.startswith("cpu") and model.fiber_count >= CHUNK:
+            native = make_native_rod_step(p.name, kernel_module("rod_lanes", p.name))
+            chunks = (model.fiber_count + CHUNK - 1) // CHUNK
+            return Launch("fibers", native, chunks, inputs, split=True)
         module = kernel_module("loaded_rods", p.name) if loaded else self.module
         kernel = make_rod_step(p.name, loaded, module)
         return Launch("fibers", kernel, model.fiber_count, inputs, split=True)

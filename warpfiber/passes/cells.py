@@ -34,7 +34,8 @@ NO_WRAP = image_code(0, 0, 0)
 class ListFeatures:
     """Which axes wrap, whether shear resets the lattice, whether segments are cut into pieces.
 
-    `loose`: the list is pruned, so what only float32 holds for near may stay.
+    `loose`: the list is pruned, so what only float32 holds for near may stay. `slides`: segments
+    have extensions of their own, instead of one for all.
     """
 
     periodic: tuple[bool, bool, bool]
@@ -43,6 +44,7 @@ class ListFeatures:
     pieces: bool = False
     closed: bool = False  # segments that end at the first node of their fiber
     loose: bool = False
+    slides: bool = False
 
 
 # Cell order is random order in memory: what the pieces after this one need is asked for early.
@@ -75,6 +77,7 @@ def make_cell_kernels(
     resets = features.shear_axes is not None
     sheared = features.sheared
     pieces, closed, loose = features.pieces, features.closed, features.loose
+    slides = features.slides
     half = wp.float64(0.5)
     stored = wp.float32 if native else wp.vec4f
     options = {"module": module, "enable_backward": False, "grid_stride": False}
@@ -217,6 +220,7 @@ def make_cell_kernels(
         segment_node: wp.array(dtype=wp.int32),
         segment_end: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
+        segment_extension: wp.array(dtype=real),
         piece_wrap_out: wp.array(dtype=wp.int32),
         key_out: wp.array(dtype=wp.int32),
         order_out: wp.array(dtype=wp.int32),
@@ -236,8 +240,11 @@ def make_cell_kernels(
         if wp.static(pieces):
             middle = start + middle_fraction(piece_part[e]) * (end - start)
             if sizes[2] > wp.float64(0.0):
+                longer = sizes[2]
+                if wp.static(slides):
+                    longer = wp.float64(segment_extension[i])
                 share = middle_fraction(piece_part[e]) - half
-                middle += (wp.float64(2.0) * sizes[2] * share) * wp.normalize(end - start)
+                middle += (wp.float64(2.0) * longer * share) * wp.normalize(end - start)
         x = inverse[0] * (middle - low)
         n = wrap_count(x)
         piece_wrap_out[e] = n[0] + wp.static(WRAP_Y) * n[1] + wp.static(WRAP_Z) * n[2]
@@ -263,6 +270,7 @@ def make_cell_kernels(
         segment_node: wp.array(dtype=wp.int32),
         segment_end: wp.array(dtype=wp.int32),
         node_pos: wp.array(dtype=vec3),
+        segment_extension: wp.array(dtype=real),
         geometry_out: wp.array(dtype=stored),
         start_out: wp.array(dtype=vec3),
         axis_out: wp.array(dtype=vec3),
@@ -286,7 +294,10 @@ def make_cell_kernels(
             after = segment_end[i]
         axis = node_pos[after] - start
         if sizes[2] > wp.float64(0.0):
-            reach = real(sizes[2]) / wp.length(axis) * axis
+            longer = real(sizes[2])
+            if wp.static(slides):
+                longer = segment_extension[i]
+            reach = longer / wp.length(axis) * axis
             start -= reach
             axis += reach + reach
         if not wp.static(loose):

@@ -35,6 +35,7 @@ class CheckFeatures:
     arrays: bool = False  # some walls are arrays of fibers
     tears: bool = False  # a step that tears a segment is as one that ends nowhere
     renewed: bool = False  # only what the second solve moved is looked at again
+    picked: bool = False  # overlaps of pairs are known but of segments that are to be looked at
 
 
 @cache
@@ -80,6 +81,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         row_count: wp.array(dtype=wp.int32),
+        segment_look: wp.array(dtype=wp.uint8),
         status: wp.array(dtype=wp.int32),
         overlap_out: wp.array(dtype=real),
         overlap_partner_out: wp.array(dtype=wp.int32),
@@ -104,6 +106,18 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         node_i = segment_node[i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
+        longest2 = lost
+        if wp.static(features.tears):
+            rest = groups[fiber_group[segment_fiber[i]]].rest
+            longest2 = tear2 * rest * rest
+        is_lost = not (wp.length_sq(xi) < lost and wp.length_sq(a) < longest2)
+        if wp.static(features.picked and not has_walls):
+            if segment_look[i] == wp.uint8(0):
+                if is_lost:
+                    overlap_out[i] = lost
+                crossed_out[i] = 0
+                crossed_partner_out[i] = -1
+                return
         back_i = node_back[node_i]
         wa = a - (node_back[node_i + 1] - back_i)
         move_i = xi - back_i
@@ -111,18 +125,20 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         partner = wp.int32(-1)
         crossed = wp.int32(0)
         crossed_partner = wp.int32(-1)
-        longest2 = lost
-        if wp.static(features.tears):
-            rest = groups[fiber_group[segment_fiber[i]]].rest
-            longest2 = tear2 * rest * rest
-        if not (wp.length_sq(xi) < lost and wp.length_sq(a) < longest2):
+        pairs_end = out_start[i + 1]
+        if wp.static(features.picked and has_walls):
+            if segment_look[i] == wp.uint8(0):
+                largest = overlap_out[i]
+                partner = overlap_partner_out[i]
+                pairs_end = out_start[i]
+        if is_lost:
             largest = lost
         mine = zero
         if wp.static(features.shifted):
             mine = segment_shift[i]
             if wp.static(features.again):
                 mine += shift_again[i]
-        for k in range(out_start[i], out_start[i + 1]):
+        for k in range(out_start[i], pairs_end):
             j = pair_j[k]
             if wp.static(features.shifted):
                 shifted = mine + segment_shift[j]
@@ -234,6 +250,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         chunks: wp.int32,
         segment_overlap: wp.array(dtype=real),
         segment_crossed: wp.array(dtype=wp.int32),
+        row_count: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         overlap_at_out: wp.array(dtype=wp.int32),
         crossed_out: wp.array(dtype=wp.int32),
@@ -242,6 +259,9 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
         """Segment with the largest overlap of every run of segments, and its crossings."""
         if status[wp.static(HALT)] != 0:
             return
+        if wp.static(features.renewed):  # else nothing was looked at again
+            if row_count[0] == 0:
+                return
         chunk = wp.tid()
         segments = wp.int64(segment_overlap.shape[0])
         begin = wp.int32(segments * wp.int64(chunk) / wp.int64(chunks))

@@ -22,6 +22,7 @@ from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_bound import make_list_bound
+from warpfiber.passes.native_check import make_native_check
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import native_chunks
 from warpfiber.passes.unilateral import ContactDual
@@ -80,13 +81,24 @@ class ContactCheck:
             arrays=bool(domain.arrays),
             tears=tears,
         )
+        self.native = model.device.startswith("cpu")
+        radii = {row["radius"] for row in model.group_rows}
+        # what is held needs the law of pairs for itself
+        picked = self.native and len(radii) == 1 and fiber_frozen is None
+        self.features = features = dataclasses.replace(features, picked=picked)
         module = kernel_module("check", name, features)
         self.kernels = dict(make_check_sweeps(name, features, module))
+        if picked:
+            known = features.periodic, features.shifted, features.again
+            self.kernels["check_pairs"] = make_native_check(name, *known, module)
+        self.segment_look = wp.zeros(
+            model.segment_count if picked else 0, dtype=wp.uint8, device=model.device
+        )
         if renews:
-            second = dataclasses.replace(features, again=True, renewed=True)
+            second = dataclasses.replace(features, again=True, renewed=True, picked=False)
             renewed = make_check_sweeps(name, second, kernel_module("check", name, second))
             self.kernels["check_again"] = renewed["check_segments"]
-        self.native = model.device.startswith("cpu")
+            self.kernels["reduce_again"] = renewed["reduce_check"]
         self.kernels |= make_list_bound(name, module, self.native)
         self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
@@ -146,6 +158,7 @@ class ContactCheck:
             self.solves[0][0].pair_clear if self.solves else self.overlap,
             *self._shifts(),
             self.solves[1][0].row_count if self.renews else self.found,
+            self.segment_look,
             state.status,
             self.overlap,
             self.overlap_partner,
@@ -154,16 +167,44 @@ class ContactCheck:
         ]
         chunks = self.overlap_at.shape[0]
         reduced = [self.overlap_at, self.crossed_of, self.crossed_at]
+        reduce = "reduce_again" if name == "check_again" else "reduce_check"
+        moved = self.solves[1][0].row_count if self.renews else self.found
         finish = [self.overlap, self.overlap_partner, self.crossed_partner, *reduced]
         return [
+            *([] if name == "check_again" else self._pairs(widest)),
             self._launch(name, model.segment_count, segments, split=True),
             self._launch(
-                "reduce_check",
+                reduce,
                 chunks,
-                [chunks, self.overlap, self.crossed, state.status, *reduced],
+                [chunks, self.overlap, self.crossed, moved, state.status, *reduced],
             ),
             self._launch("finish_check", 1, [*finish, state.status, self.largest, self.found]),
         ]
+
+    def _pairs(self, radius: float) -> list[Launch | Call]:
+        """Overlaps of pairs in vectors, where these can tell them."""
+        if "check_pairs" not in self.kernels:
+            return []
+        model, state, pairs = self.model, self.state, self.pairs
+        inputs = [
+            model.precision.real(radius),
+            model.segment_node,
+            pairs.out_start,
+            pairs.pair_i,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.lattice_back,
+            self.lattice_now,
+            self.node_back,
+            state.node_pos,
+            self.solves[0][0].pair_clear if self.solves else self.overlap,
+            *self._shifts(),
+            state.status,
+            self.overlap,
+            self.overlap_partner,
+            self.segment_look,
+        ]
+        return [self._launch("check_pairs", native_chunks(model.segment_count), inputs, split=True)]
 
     def _shifts(self) -> list[Any]:
         """How far both solves moved each segment at most."""
@@ -180,6 +221,7 @@ class ContactCheck:
             model.segment_count,
             model.segment_node,
             self.pairs.skin_out,
+            self.pairs.segment_extension,
             model.fiber_node_start,
             state.deformation,
             deformation,
@@ -188,6 +230,7 @@ class ContactCheck:
             node_pos,
             *self._shifts(),
             state.status,
+            self.pairs_known,
             self.step_strain,
             self.segment_moved,
             self.part_short,

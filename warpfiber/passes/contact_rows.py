@@ -20,12 +20,14 @@ from warpfiber.laws.lubrication import OUTER
 from warpfiber.model import Model, State
 from warpfiber.passes.array_rows import wall_arrays
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native_row_fill import fill_pairs, make_native_row_fill
 from warpfiber.passes.native_row_slots import FIRST, LAST
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
-from warpfiber.passes.row_fill import make_row_fill
+from warpfiber.passes.row_fill import KEY_IMAGE, make_row_fill
 from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
 
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
@@ -74,17 +76,26 @@ class ContactRows:
         self.node_foreseen = node_foreseen if self.foresees else state.node_pos
         self.keep, self.near_now = keep, near_now
         domain = model.domain
+        native = model.device.startswith("cpu")
+        radii = {row["radius"] for row in model.group_rows}
         self.features = RowFeatures(
-            any(domain.periodic), domain.wall, lubrication, bool(domain.arrays), chosen is not None
+            any(domain.periodic),
+            domain.wall,
+            lubrication,
+            bool(domain.arrays),
+            chosen is not None,
+            filled=native and len(radii) == 1 and lubrication == "none",
         )
         self.chosen = wp.zeros(0, dtype=wp.uint8, device=model.device) if chosen is None else chosen
         name, features = model.precision.name, self.features
         module = kernel_module("rows", name, features)
         self.kernels = dict(make_row_count(name, features, module))
-        native = model.device.startswith("cpu")
         self.kernels["pair_motion"] = make_pair_motion(name, features.periodic, module, native)
         self.motion_dim = native_chunks(model.segment_count) if native else model.segment_count
         self.kernels["fill_rows"] = make_row_fill(name, features, module)
+        if features.filled:
+            fill = make_native_row_fill(name, features.periodic, KEY_IMAGE, module)
+            self.kernels["fill_pairs"] = fill
         self.rub: RowSlip | None = None
         if friction is not None:
             held = friction.fiber_frozen is not None
@@ -95,6 +106,8 @@ class ContactRows:
         self.row_out_start = self._int(segments + 1)
         self.carried_start = self._int(segments + 1)
         self.segment_rows = self._int(segments)
+        # segments of which pairs are left to be decided
+        self.segment_look = wp.zeros(segments, dtype=wp.uint8, device=model.device)
         self.row_count, self.row_need = self._int(1), self._int(1)
         # whether `pair_clear` is that of the last step, and what the next may take off it
         self.pairs_known = self._int(1)
@@ -144,7 +157,7 @@ class ContactRows:
 
     def grow(self) -> bool:
         """More room if the last step did not fit; then its launches are to be made again."""
-        need = int(self.row_need.numpy()[0])
+        need = int(host_view(self.row_need)[0])
         if need == 0:
             return False
         kept = self._carried()
@@ -186,6 +199,7 @@ class ContactRows:
             self._launch("count_rows", self._count_inputs()),
             Call("row_scan", scan),
             Launch("limit_rows", self.kernels["limit_rows"], 1, limit),
+            *(fill_pairs(self) if self.features.filled else []),
             self._launch("fill_rows", self._fill_inputs()),
             *(rub.fill(self.kernels, self) if rub is not None else []),
         ]
@@ -216,6 +230,9 @@ class ContactRows:
             self.segment_moved,
             pair_clear,
             self.pair_slots,
+            self.pair_row_count,
+            self.segment_rows,
+            self.segment_look,
         ]
         kernel = self.kernels["pair_motion"]
         return Launch("pair_motion", kernel, self.motion_dim, inputs, split=True, follows=True)
@@ -276,6 +293,7 @@ class ContactRows:
             self.node_foreseen,
             self.state.status,
             self.chosen,
+            self.segment_look,
             self.pair_slots,
             self.pair_row_count,
             self.segment_rows,
@@ -303,16 +321,13 @@ class ContactRows:
             state.status,
             self.row_out_start,
             self.pair_row,
-            self.row_i,
-            self.row_j,
-            self.row_key,
-            self.row_s,
-            self.row_t,
-            self.row_normal,
-            self.row_base,
-            self.row_compliance,
-            self.row_force,
+            *self.written(),
         ]
+
+    def written(self) -> list[Any]:
+        """The arrays of the rows, as they are filled."""
+        names = "i j key s t normal base compliance force".split()
+        return [getattr(self, f"row_{name}") for name in names]
 
     # -- what is saved ----------------------------------------------------------------------------
 

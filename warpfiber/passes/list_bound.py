@@ -61,6 +61,12 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         """F of the step alone."""
         return mat33(after[0] * wp.inverse(before[0]))
 
+    @wp.func
+    def is_new(before: wp.array(dtype=wp.mat33d)) -> wp.bool:
+        """Whether the flow has carried nothing since the build: pairs are not those of before."""
+        carried = before[0] - wp.identity(n=3, dtype=wp.float64)
+        return wp.ddot(carried, carried) == wp.float64(0.0)
+
     @wp.kernel(**options)
     def bound_fibers(
         offset: wp.int32,
@@ -68,6 +74,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segments: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
+        segment_extension: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
         deformation_back: wp.array(dtype=wp.mat33d),
         deformation: wp.array(dtype=wp.mat33d),
@@ -77,6 +84,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
+        pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
@@ -91,6 +99,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push = step_push(deformation_back, deformation)
         if fiber == 0:
             step_strain_out[0] = largest_strain(push)
+            if is_new(deformation_back):
+                pairs_known_out[0] = 0
         found = wp.int32(0)
         slid = zero
         across = zero
@@ -98,7 +108,10 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
             listed = list_pos[i + 1] - list_pos[i]
             length = wp.length(listed)
-            beyond = list_sizes[2] / length
+            longer = list_sizes[2]
+            if segment_extension.shape[0] > 0:
+                longer = segment_extension[i - fiber]
+            beyond = longer / length
             start = flow_origin + affine * (list_pos[i] - flow_origin)
             axis = affine * listed
             inverse = one / wp.dot(axis, axis)
@@ -133,6 +146,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push: mat33,
         limit: real,
         extension: real,
+        segment_extension: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
         list_pos: wp.array(dtype=vec3),
         node_back: wp.array(dtype=vec3),
@@ -152,6 +166,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segments: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
+        segment_extension: wp.array(dtype=real),
         fiber_node_start: wp.array(dtype=wp.int32),
         deformation_back: wp.array(dtype=wp.mat33d),
         deformation: wp.array(dtype=wp.mat33d),
@@ -161,6 +176,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
+        pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
         short_out: wp.array(dtype=wp.int32),
@@ -175,6 +191,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         push = step_push(deformation_back, deformation)
         if chunk == 0:
             step_strain_out[0] = largest_strain(push)
+            if is_new(deformation_back):
+                pairs_known_out[0] = 0
         bound_block(
             first,
             wp.min(first + wp.static(CHUNK_SEGMENTS), segments),
@@ -184,6 +202,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             push,
             farthest_motion(affine, list_sizes),
             list_sizes[2],
+            segment_extension,
             segment_node,
             list_pos,
             node_back,
@@ -229,7 +248,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
     ):
         """At the end of a step that is kept; `share_back` its share, 0 where the list is new.
 
-        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one.
+        `pairs_known`: how far its pairs stayed apart bounds how near they come in the next one,
+        unless the list is new by then.
         """
         if status[wp.static(HALT)] + rejected[0] != 0:
             return

@@ -60,6 +60,7 @@ def _bin(pairs: NeighborList) -> Launches:
             state.fiber_image,
             state.list_pos,
         ),
+        *(_extend(pairs) if pairs.slide_origin is not None else []),
         _launch(
             pairs,
             "start_list",
@@ -88,10 +89,24 @@ def _bin(pairs: NeighborList) -> Launches:
             model.segment_node,
             model.segment_end,
             state.node_pos,
+            pairs.segment_extension,
             pairs.piece_wrap,
             pairs.cell_key,
             pairs.order,
         ),
+    ]
+
+
+def _extend(pairs: NeighborList) -> Launches:
+    model, state = pairs.model, pairs.state
+    slide, fastest = pairs.segment_slide, pairs.fastest_slide
+    move = [state.gradient, model.segment_node, state.node_pos, state.node_velocity, slide]
+    extend = [pairs.wraps, pairs.sizes, slide, fastest, pairs.segment_extension]
+    count, origin = model.segment_count, model.precision.vec3(*pairs.slide_origin)
+    return [
+        _launch(pairs, "slide_segments", count, origin, *move),
+        _launch(pairs, "fastest_slide", 1, slide, fastest, split=False),
+        _launch(pairs, "extend_segments", count, *extend),
     ]
 
 
@@ -111,6 +126,7 @@ def _gather(pairs: NeighborList) -> Launch:
         pairs.model.segment_node,
         pairs.model.segment_end,
         pairs.state.node_pos,
+        pairs.segment_extension,
         pairs.geometry,
         pairs.sorted_start,
         pairs.sorted_axis,

@@ -4,29 +4,9 @@ Repeats the plain kernel there, one lane per segment.
 Symbols: as there.
 """
 
-from warpfiber.passes.native import lane_types
+from warpfiber.passes.native_pair_lanes import row_lanes
 
 TEXT = """
-    typedef T R __attribute__((ext_vector_type(4)));
-    auto load = [](const T* p) -> R { R r; __builtin_memcpy(&r, p, sizeof(r)); return r; };
-    // rows (x, y, z, unused) as they lie in memory to a vector per component
-    auto transposed = [](const R* m) -> V3 {
-        V3 p;
-        for (int q = 0; q < W; q += 4) {
-            const R lo0 = __builtin_shufflevector(m[q], m[q + 1], 0, 4, 2, 6);
-            const R hi0 = __builtin_shufflevector(m[q], m[q + 1], 1, 5, 3, 7);
-            const R lo1 = __builtin_shufflevector(m[q + 2], m[q + 3], 0, 4, 2, 6);
-            const R hi1 = __builtin_shufflevector(m[q + 2], m[q + 3], 1, 5, 3, 7);
-            const R x = __builtin_shufflevector(lo0, lo1, 0, 1, 4, 5);
-            const R y = __builtin_shufflevector(hi0, hi1, 0, 1, 4, 5);
-            const R z = __builtin_shufflevector(lo0, lo1, 2, 3, 6, 7);
-            __builtin_memcpy((T*)&p.x + q, &x, sizeof(x));
-            __builtin_memcpy((T*)&p.y + q, &y, sizeof(y));
-            __builtin_memcpy((T*)&p.z + q, &z, sizeof(z));
-        }
-        return p;
-    };
-    auto larger = [](V u, V v) -> V { return u > v ? u : v; };
     auto times = [](const auto& m, const V3& v) -> V3 {
         return V3{v.x * m.data[0][0] + v.y * m.data[0][1] + v.z * m.data[0][2],
                   v.x * m.data[1][0] + v.y * m.data[1][1] + v.z * m.data[1][2],
@@ -53,7 +33,12 @@ TEXT = """
         const V3 ends[2] = {transposed(rows[2]), transposed(rows[3])};
         const V3 back[2] = {transposed(rows[4]), transposed(rows[5])};
         const V length = __builtin_elementwise_sqrt(listed.dot(listed));
-        const V beyond = V(extension) / length;
+        V longer;
+        for (int l = 0; l < W; ++l) {
+            const int s = k + l < last ? k + l : last - 1;
+            longer[l] = segment_extension.shape[0] > 0 ? segment_extension.data[s] : extension;
+        }
+        const V beyond = longer / length;
         const V3 start = origin + times(affine, from - origin), axis = times(affine, listed);
         const V inverse = one / axis.dot(axis);
         V moved2 = zero;
@@ -93,4 +78,4 @@ TEXT = """
 
 def bound_text(name: str) -> str:
     """The block in the given precision."""
-    return lane_types(name) + TEXT
+    return row_lanes(name) + TEXT

@@ -106,7 +106,19 @@ TEXT = """
             for (int k = 0; k < 5; ++k) look |= close[k] | (apart2[k] < damp * damp);
         }
         bits = look ? V(T(LOOK)) : bits;
-        for (int l = 0; l < count; ++l) pair_slots.data[pairs[l]] = (unsigned char)(int)bits[l];
+        for (int l = 0; l < count; ++l) {
+            const int found = (int)bits[l];
+            if (found == 0) continue;
+            const int i = pair_i.data[pairs[l]];
+            pair_slots.data[pairs[l]] = (unsigned char)found;
+            if (found == LOOK) {
+                segment_look.data[i] = 1;
+                continue;
+            }
+            const int made = __builtin_popcount(found);
+            pair_row_count.data[pairs[l]] = made;
+            segment_rows.data[i] += made;
+        }
     };
 """
 

@@ -38,8 +38,9 @@ from warpfiber.passes.cells import (
     make_cell_kernels,
 )
 from warpfiber.passes.executor import Executor
-from warpfiber.passes.host_writes import write_array
+from warpfiber.passes.host_arrays import host_view, write_array
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.list_extension import make_extension_kernels
 from warpfiber.passes.list_launches import list_launches
 from warpfiber.passes.native_search import make_search_kernels
 from warpfiber.passes.native_sort import make_sort_kernels
@@ -64,6 +65,8 @@ class NeighborList:
     change between builds. Segments are listed as if longer by the extension at each end: what
     slides along itself uses up that before the skin.
 
+    With `slide_origin`, of the flow, each has its own part of that (`list_extension`).
+
     With `flow_origin` the pairs are pruned from a wider list (`pruning`): a build makes that one
     and prunes it, `prune` alone the arrays above.
     """
@@ -82,8 +85,10 @@ class NeighborList:
         workers: int = 1,
         native: bool | None = None,
         flow_origin: np.ndarray | None = None,
+        slide_origin: np.ndarray | None = None,
     ) -> None:
         self.model, self.state = model, state
+        self.slide_origin = slide_origin
         self.reach, self.skin = reach, skin
         self.extension = 0.0
         self.longest_rest = longest_rest
@@ -109,6 +114,7 @@ class NeighborList:
             has_pieces,
             closed,
             loose=flow_origin is not None and not has_pieces,
+            slides=slide_origin is not None,
         )
         if self.native:
             module = kernel_module("list", name, features)
@@ -117,6 +123,8 @@ class NeighborList:
             self.kernels |= make_sort_kernels(module)
         else:
             self.kernels = make_cell_kernels(name, features) | make_row_kernels(name, features)
+        if features.slides:
+            self.kernels |= make_extension_kernels(name, kernel_module("slide", name))
         if flow_origin is not None:
             self.pruning = Pruning(self, flow_origin)
             self.kernels |= self.pruning.kernels
@@ -234,6 +242,10 @@ class NeighborList:
         self.sorted_part = self._int(len(self.piece_part))
         self.out_start = self._int(segments + 1)
         self.in_start = self._int(segments + 1)
+        slides = 0 if self.slide_origin is None else segments
+        self.segment_slide = wp.zeros(slides, dtype=p.real, device=device)
+        self.segment_extension = wp.zeros(slides, dtype=p.real, device=device)
+        self.fastest_slide = wp.zeros(1, dtype=p.real, device=device)
         self.piece_total = wp.array([count], dtype=wp.int32, device=device)
         self.tally = wp.zeros(2 * self.workers, dtype=wp.int64, device=device)
         self.found_count = self._int(self.workers)
@@ -279,7 +291,7 @@ class NeighborList:
     @property
     def pair_count(self) -> int:
         """Number of listed pairs."""
-        return int(self.state.status.numpy()[PAIR_COUNT])
+        return int(host_view(self.state.status)[PAIR_COUNT])
 
     @property
     def kept_count(self) -> int:
@@ -317,7 +329,7 @@ class NeighborList:
                 launches, device = list_launches(self), self.model.device
                 self._executor = Executor(launches, device, self.workers, single=True)
             self._executor.run(1, _never)
-            status = self.state.status.numpy()
+            status = host_view(self.state.status)
             overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])
             lost = self._lost_fiber() if overflow or stretched else None
             if overflow == 0 and (not stretched or lost is not None):

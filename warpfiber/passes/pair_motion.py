@@ -2,7 +2,8 @@
 
 Rows and checks pass over what stays apart. On the CPU the rows of most others are chosen here too,
 many pairs at a time (`native_row_slots`); a pair that takes more than its own two segments to
-decide is marked LOOK, elsewhere every pair that does not stay apart is.
+decide is marked LOOK, elsewhere every pair that does not stay apart is. Rows of the others are
+counted, and segments with pairs to look at are marked.
 
 Source: no two points of two segments approach each other by more than the largest relative motion
     of their ends, so the center lines stay apart by `clear` = distance at the start - that motion.
@@ -20,90 +21,22 @@ from typing import Any
 import warp as wp
 
 from warpfiber.model import HALT, precision
-from warpfiber.passes.native import lane_types
+from warpfiber.passes.native_pair_lanes import pair_lanes
 from warpfiber.passes.native_row_slots import LOOK, slots_text
-from warpfiber.passes.pairs import IMAGE_BITS, NO_IMAGE, PairFeatures, make_pair_geometry
+from warpfiber.passes.pairs import NO_IMAGE, PairFeatures, make_pair_geometry
 from warpfiber.passes.portions import portioned
-from warpfiber.passes.row_geometry import PARALLEL, make_closest_points, make_row_geometry
+from warpfiber.passes.row_geometry import make_closest_points, make_row_geometry
 
 AHEAD = 32  # pairs whose nodes are fetched
 STRETCH = 512  # pairs of which the near ones are picked at a time
 CHUNK_SEGMENTS = 64  # per launch index on the CPU: workers share pairs in such portions
 
-# Rows (x, y, z, unused) of a pair as they lie in memory, then transposed to a vector per component;
-# the second node of a segment is read from its end, so that nothing behind the last is touched.
 BLOCK = """
-    typedef T R __attribute__((ext_vector_type(4)));
-    auto load = [](const T* p) -> R { R r; __builtin_memcpy(&r, p, sizeof(r)); return r; };
-    auto transposed = [](const R* m) -> V3 {
-        V3 p;
-        for (int q = 0; q < W; q += 4) {
-            const R lo0 = __builtin_shufflevector(m[q], m[q + 1], 0, 4, 2, 6);
-            const R hi0 = __builtin_shufflevector(m[q], m[q + 1], 1, 5, 3, 7);
-            const R lo1 = __builtin_shufflevector(m[q + 2], m[q + 3], 0, 4, 2, 6);
-            const R hi1 = __builtin_shufflevector(m[q + 2], m[q + 3], 1, 5, 3, 7);
-            const R x = __builtin_shufflevector(lo0, lo1, 0, 1, 4, 5);
-            const R y = __builtin_shufflevector(hi0, hi1, 0, 1, 4, 5);
-            const R z = __builtin_shufflevector(lo0, lo1, 2, 3, 6, 7);
-            __builtin_memcpy((T*)&p.x + q, &x, sizeof(x));
-            __builtin_memcpy((T*)&p.y + q, &y, sizeof(y));
-            __builtin_memcpy((T*)&p.z + q, &z, sizeof(z));
-        }
-        return p;
-    };
-    auto larger = [](V u, V v) -> V { return u > v ? u : v; };
-    auto clipped = [](V u) -> V {
-        u = u > V(T(0)) ? u : V(T(0));
-        return u < V(T(1)) ? u : V(T(1));
-    };
-    auto box = [&](const auto& lattice, int code) -> R {
-        const T x = T((code & MASK) - HALF), y = T(((code >> BITS) & MASK) - HALF);
-        const T z = T(((code >> (2 * BITS)) & MASK) - HALF);
-        const auto& m = lattice.data[0];
-        R r = R(T(0));
-        for (int c = 0; c < 3; ++c) r[c] = m.data[c][0] * x + m.data[c][1] * y + m.data[c][2] * z;
-        return r;
-    };
-    const T* const back = (const T*)node_back.data;
-    const T* const now = (const T*)node_pos.data;
-    // D, a, b at the start, w, wa, wb, of pairs anywhere in the list
-    struct Motion { V3 d, a, b, w, wa, wb; };
-    auto motion_of = [&](const int* pairs) -> Motion {
-        R ra[W], rb[W], rd[W], rw[W], rwa[W], rwb[W];
-        for (int l = 0; l < W; ++l) {
-            const int pair = pairs[l];
-            const long long i = 3ll * segment_node.data[pair_i.data[pair]];
-            const long long j = 3ll * segment_node.data[pair_j.data[pair]];
-            const R xi = load(back + i), xj = load(back + j);
-            const R xi1 = load(back + i + 2).yzww, xj1 = load(back + j + 2).yzww;
-            const R mi = load(now + i) - xi, mj = load(now + j) - xj;
-            ra[l] = xi1 - xi;
-            rb[l] = xj1 - xj;
-            rd[l] = xj - xi;
-            rw[l] = mj - mi;
-            rwa[l] = load(now + i + 2).yzww - xi1 - mi;
-            rwb[l] = load(now + j + 2).yzww - xj1 - mj;
-            const int code = pair_image.data[pair];
-            if (PERIODIC && code != NONE) {
-                const R shift = box(lattice_back, code);
-                rd[l] += shift;
-                rw[l] += box(lattice_now, code) - shift;
-            }
-        }
-        return Motion{transposed(rd), transposed(ra), transposed(rb),
-                      transposed(rw), transposed(rwa), transposed(rwb)};
-    };
-    const V least = V(T(1e-30));
-    struct Place { V s, t; };
-    auto closest = [&](const Motion& m, V aa, V bb) -> Place {
-        const V3 n = m.a.cross(m.b);
-        const V area2 = n.dot(n), ab = m.a.dot(m.b);
-        V s = clipped(m.d.cross(m.b).dot(n) / larger(area2, least));
-        s = area2 >= T(PARALLEL) * aa * bb ? s : V(T(0.5));
-        const V t = clipped((s * ab - m.d.dot(m.b)) / bb);
-        return Place{clipped((t * ab + m.d.dot(m.a)) / aa), t};
-    };
 SLOTS
+    for (int i = first_segment; i < last_segment; ++i) {
+        segment_rows.data[i] = 0;
+        segment_look.data[i] = 0;
+    }
     int waiting[2 * W], held = 0;
     // pairs that may have come near since, in order, a stretch of the list at a time
     int near[STRETCH + W];
@@ -119,6 +52,7 @@ SLOTS
         const bool far = known & (clear > looked_at);
         pair_clear.data[k] = clear;
         pair_slots.data[k] = 0;
+        pair_row_count.data[k] = 0;
         count += far ? 0 : 1;
     }
     for (int n = 0; n < W; ++n) near[count + n] = count > 0 ? near[count - 1] : begin;
@@ -209,6 +143,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
+        pair_row_count: wp.array(dtype=wp.int32),
+        segment_rows: wp.array(dtype=wp.int32),
+        segment_look: wp.array(dtype=wp.uint8),
     ):
         if status[wp.static(HALT)] != 0:
             return
@@ -219,12 +156,15 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         move_i = node_pos[node_i] - xi
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
         stays = real(1.0) - step_strain[0]
+        segment_rows[i] = 0
+        looked_for = wp.uint8(0)
         for k in range(out_start[i], out_start[i + 1]):
             if pairs_known[0] != 0:
                 least = stays * pair_clear[k] - segment_moved[i] - segment_moved[pair_j[k]]
                 if least > looked_at:
                     pair_clear[k] = least
                     pair_slots[k] = wp.uint8(0)
+                    pair_row_count[k] = 0
                     continue
             node_j = segment_node[pair_j[k]]
             xj = node_back[node_j]
@@ -241,26 +181,23 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             off_flow = segment_moved[i] + segment_moved[pair_j[k]]
             clear = wp.max(distance - largest_motion(w, wa, wb), stays * distance - off_flow)
             pair_clear[k] = clear
-            pair_slots[k] = wp.uint8(wp.where(clear > looked_at, 0, wp.static(LOOK)))
+            near = wp.uint8(wp.where(clear > looked_at, 0, 1))
+            pair_slots[k] = wp.uint8(wp.static(LOOK)) * near
+            pair_row_count[k] = 0
+            looked_for = looked_for | near
+        segment_look[i] = looked_for
 
     if not native:
         return pair_motion
 
     text = BLOCK.replace("SLOTS", slots_text(name))
-    for key, value in {
-        "MASK": (1 << IMAGE_BITS) - 1,
-        "HALF": 1 << (IMAGE_BITS - 1),
-        "BITS": IMAGE_BITS,
-        "AHEAD": AHEAD,
-        "STRETCH": STRETCH,
-        "PERIODIC": str(periodic).lower(),
-        "NONE": NO_IMAGE,
-        "PARALLEL": repr(PARALLEL),
-    }.items():
+    for key, value in {"AHEAD": AHEAD, "STRETCH": STRETCH, "NONE": NO_IMAGE}.items():
         text = text.replace(key, str(value))
 
-    @wp.func_native(lane_types(name) + text)
+    @wp.func_native(pair_lanes(name, periodic) + text)
     def motion_block(
+        first_segment: wp.int32,
+        last_segment: wp.int32,
         first: wp.int32,
         last: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
@@ -284,6 +221,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
+        pair_row_count: wp.array(dtype=wp.int32),
+        segment_rows: wp.array(dtype=wp.int32),
+        segment_look: wp.array(dtype=wp.uint8),
     ): ...
 
     @wp.kernel(**options)
@@ -313,14 +253,20 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
         segment_moved: wp.array(dtype=real),
         pair_clear: wp.array(dtype=real),
         pair_slots: wp.array(dtype=wp.uint8),
+        pair_row_count: wp.array(dtype=wp.int32),
+        segment_rows: wp.array(dtype=wp.int32),
+        segment_look: wp.array(dtype=wp.uint8),
     ):
         if status[wp.static(HALT)] != 0:
             return
         chunks = (segments + wp.static(CHUNK_SEGMENTS - 1)) / wp.static(CHUNK_SEGMENTS)
         begin = portioned(wp.tid() + offset, chunks, 1) * wp.static(CHUNK_SEGMENTS)
+        end = wp.min(begin + wp.static(CHUNK_SEGMENTS), segments)
         motion_block(
+            begin,
+            end,
             out_start[begin],
-            out_start[wp.min(begin + wp.static(CHUNK_SEGMENTS), segments)],
+            out_start[end],
             segment_node,
             pair_i,
             pair_j,
@@ -342,6 +288,9 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
             segment_moved,
             pair_clear,
             pair_slots,
+            pair_row_count,
+            segment_rows,
+            segment_look,
         )
 
     return native_pair_motion

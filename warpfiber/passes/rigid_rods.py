@@ -25,7 +25,10 @@ from warpfiber.laws.flow import make_flow
 from warpfiber.laws.rod_mobility import make_rod_alignment, make_rod_mobility
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.exponential import make_exponential
+from warpfiber.passes.native_rods import rods_text
 from warpfiber.passes.precision import group_struct
+
+CHUNK = 64  # rods per launch index on the CPU
 
 
 @cache
@@ -176,3 +179,78 @@ def make_rod_step(name: str, loaded: bool, module: str = "unique"):
             status[wp.static(BAD_FIBER)] = fiber
 
     return rod_step
+
+
+@cache
+def make_native_rod_step(name: str, module: str = "unique"):
+    """Kernel `native_rod_step`: the same of rods of one shape without loads, over CHUNK rods each.
+
+    For the CPU; takes what `rod_step` takes.
+    """
+    p = precision(name)
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    Group = group_struct(name)
+    RodMap = rod_map(name)
+
+    @wp.func_native(rods_text(name))
+    def step_rods(
+        first: wp.int32,
+        last: wp.int32,
+        keeps: wp.int32,
+        half_length: real,
+        flow_origin: vec3,
+        turn: mat33,
+        move: mat33,
+        drift: mat33,
+        turning: mat33,
+        gradient: mat33,
+        settling: vec3,
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        node_back: wp.array(dtype=vec3),
+        velocity_back: wp.array(dtype=vec3),
+    ) -> wp.int32: ...
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    def native_rod_step(
+        offset: wp.int32,
+        keeps: wp.int32,
+        flow_origin: vec3,
+        maps: wp.array(dtype=RodMap),
+        rod_shape: wp.array(dtype=wp.int32),
+        groups: wp.array(dtype=Group),
+        fiber_group: wp.array(dtype=wp.int32),
+        step_size: wp.array(dtype=wp.float64),
+        node_load: wp.array(dtype=vec3),
+        node_pos: wp.array(dtype=vec3),
+        node_velocity: wp.array(dtype=vec3),
+        node_back: wp.array(dtype=vec3),
+        velocity_back: wp.array(dtype=vec3),
+        status: wp.array(dtype=wp.int32),
+    ):
+        if status[wp.static(HALT)] != 0:
+            return
+        first = wp.static(CHUNK) * (wp.tid() + offset)
+        m = maps[0]
+        lost = step_rods(
+            first,
+            wp.min(first + wp.static(CHUNK), fiber_group.shape[0]),
+            keeps,
+            real(0.5) * groups[0].rest,
+            flow_origin,
+            m.turn,
+            m.move,
+            m.drift,
+            m.turning,
+            m.gradient,
+            m.settling,
+            node_pos,
+            node_velocity,
+            node_back,
+            velocity_back,
+        )
+        if lost >= 0:
+            status[wp.static(TORN)] = 1
+            status[wp.static(BAD_FIBER)] = lost
+
+    return native_rod_step

@@ -39,6 +39,7 @@ class RowFeatures:
     lubrication: str = "none"  # none, paper, shifted
     arrays: bool = False  # some walls are arrays of fibers
     chosen: bool = False  # rows of some segments alone
+    filled: bool = False  # those of pairs are written in vectors
 
 
 @cache
@@ -108,11 +109,15 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         node_pos: wp.array(dtype=vec3),
         status: wp.array(dtype=wp.int32),
         segment_chosen: wp.array(dtype=wp.uint8),
+        segment_look: wp.array(dtype=wp.uint8),
         pair_slots_out: wp.array(dtype=wp.uint8),
         pair_row_count_out: wp.array(dtype=wp.int32),
         segment_rows_out: wp.array(dtype=wp.int32),
     ):
-        """`keep`, `near_now` in radii of the thinner fiber, `widest` the largest radius of all."""
+        """`keep`, `near_now` in radii of the thinner fiber, `widest` the largest radius of all.
+
+        `segment_rows`: those decided so far, unless some segments are chosen.
+        """
         if status[wp.static(HALT)] != 0:
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
@@ -122,6 +127,9 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
                 for k in range(out_start[i], out_start[i + 1]):
                     pair_row_count_out[k] = 0
                 return
+        if wp.static(not features.chosen and not has_walls):
+            if segment_look[i] == wp.uint8(0):
+                return
         node_i = segment_node[i]
         xi = node_back[node_i]
         a = node_back[node_i + 1] - xi
@@ -129,15 +137,15 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
         reach = (real(2.0) + wp.max(keep, near_now)) * widest
         total = wp.int32(0)
-        for k in range(out_start[i], out_start[i + 1]):
-            known = wp.int32(pair_slots_out[k])
-            if known != wp.static(LOOK):
-                rows = wp.int32(0)
-                if known != 0:
-                    for slot in range(wp.static(SLOTS)):
-                        rows += (known >> slot) & 1
-                pair_row_count_out[k] = rows
-                total += rows
+        pairs_end = out_start[i + 1]
+        if wp.static(not features.chosen):
+            total = segment_rows_out[i]
+            if segment_look[i] == wp.uint8(0):
+                pairs_end = out_start[i]
+        for k in range(out_start[i], pairs_end):
+            if pair_slots_out[k] != wp.uint8(wp.static(LOOK)):
+                if wp.static(features.chosen):
+                    pair_row_count_out[k] = 0
                 continue
             j = pair_j[k]
             node_j = segment_node[j]

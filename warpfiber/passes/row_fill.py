@@ -124,6 +124,8 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
             for k in range(out_start[i], out_start[i + 1]):
                 pair_row_count[k] = 0
             return
+        if wp.static(features.filled and not has_walls):
+            return
         r = row_out_start[i]
         if r == row_out_start[i + 1]:
             return
@@ -137,6 +139,9 @@ def make_row_fill(name: str, features: RowFeatures, module: str = "unique"):
         fiber_i = segment_fiber[i]
         gi = groups[fiber_group[fiber_i]]
         for k in range(out_start[i], out_start[i + 1]):
+            if wp.static(features.filled):
+                r += pair_row_count[k]
+                continue
             if pair_row_count[k] == 0:
                 continue
             pair_row_out[k] = r

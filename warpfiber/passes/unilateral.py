@@ -27,6 +27,7 @@ from warpfiber.passes.dual_rows import (
 )
 from warpfiber.passes.dual_setup import make_dual_begin, make_dual_lists
 from warpfiber.passes.executor import Call, Launch, Repeat
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.row_slip import RowSlip
 
@@ -337,7 +338,7 @@ class ContactDual:
     @property
     def unsolved(self) -> int:
         """Solves so far that stopped at their limit."""
-        return int(self.control.numpy()[UNSOLVED])
+        return int(host_view(self.control)[UNSOLVED])
 
     @property
     def fault(self) -> float:
