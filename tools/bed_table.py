@@ -1,8 +1,9 @@
 """What pressed, pulled and sheared beds show: `tools/bed_table.py [--picture PNG] FOLDER ...`.
 
-Runs whose scenes differ by their seed alone make one column: of every quantity the mean over them,
-the standard deviation of one run, and `-` where no run has it; the head of a column names what the
-scenes differ by, and the number of runs. Pressed, pulled and sheared beds make a table each.
+Runs whose scenes differ by their seed (or the number of cycles) alone make one column: of every
+quantity the mean over them, the standard deviation of one run, and `-` where no run has it; the
+head of a column names what the scenes differ by, and the number of runs. Pressed, pulled and
+sheared beds make a table each.
 Symbols: P pressure on the upper wall (`low`: on the lower), phi volume fraction, Z touching fibers
     per fiber, F mean contact force (`pair`: by touching pair of fibers), L_s free height between
     the grips, D_F maximum Feret diameter of the stress-free shape, L_c length of the centerline, d
@@ -36,7 +37,17 @@ WINDOW = 0.005  # of phi
 FRACTIONS = (0.20, 0.25, 0.28, 0.30, 0.35, 0.40)
 PRESSURES = (200.0, 500.0, 1000.0)  # Pa
 REST_PART = 0.05  # of settling, at its end: what is measured at rest
-APART = {"seed", "title", "path", "notes", "resolved", "record", "from", "volume_fraction_achieved"}
+APART = {
+    "seed",
+    "repeat",
+    "title",
+    "path",
+    "notes",
+    "resolved",
+    "record",
+    "from",
+    "volume_fraction_achieved",
+}
 NAMED = {"settle": "settled", "pour": "settled", "pull": "pulled", "shear": "sheared"}
 ENDED = re.compile(r"stage '.*' ended at time ([-+.\deE]+)")
 

@@ -12,7 +12,8 @@
                                                   of explicit steps (parts: see bench_contact.py)
     python tools/bench.py plate [PART ...]        the sliding-plate cell: error of A against time
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
-    --workers W, --repeats N, --method M, --dry (print, do not write)
+    --workers W, --repeats N, --method M, --shuffled (engine: large cells numbered in no order),
+    --dry (print, do not write)
 
 A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
 compare only within one run of this tool.
@@ -98,7 +99,8 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Cells of r_f = 50 fibers at V_f = 0.1, segments of 5 diameters, repulsion only.
 
     The density is chosen so that half the stable step is the asked strain per step. Large cells are
-    made of periodic copies of one with a few thousand fibers.
+    made of periodic copies of one with a few thousand fibers, which are numbered copy by copy;
+    with `--shuffled` in no order, as fibers placed at random are.
     """
     for precision in args.precisions:
         for fibers in args.fibers:
@@ -127,7 +129,10 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 overrides["fibers.0.count"] = fibers // tiles**3
                 part = wf.load_scene(SCENES / "shear_cell.toml", overrides)
                 placement = tiled(place_fibers(part), tiles, edge / tiles)
-            yield cell_speed(scene, args, placement) | {"bench": "engine"}
+            order = "copies" if tiles > 1 else "random"
+            if placement is not None and args.shuffled:
+                placement, order = shuffled(placement), "random"
+            yield cell_speed(scene, args, placement) | {"bench": "engine", "numbering": order}
 
 
 def tiled(part: Placement, tiles: int, edge: float) -> Placement:
@@ -139,6 +144,18 @@ def tiled(part: Placement, tiles: int, edge: float) -> Placement:
         nodes.reshape(-1, 3),
         np.concatenate([[0], np.cumsum(per_fiber)]).astype(np.int32),
         np.tile(part.fiber_group, len(copies)),
+    )
+
+
+def shuffled(placement: Placement) -> Placement:
+    """The same fibers, numbered in no order."""
+    counts = np.diff(placement.fiber_node_start)
+    order = np.random.default_rng(1).permutation(len(counts))
+    parts = np.split(placement.node_pos, placement.fiber_node_start[1:-1])
+    return Placement(
+        np.concatenate([parts[fiber] for fiber in order]),
+        np.concatenate([[0], np.cumsum(counts[order])]).astype(np.int32),
+        placement.fiber_group[order],
     )
 
 
@@ -302,6 +319,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--set", action="append", default=[], type=_override)
+    parser.add_argument("--shuffled", action="store_true", help="number large cells at random")
     parser.add_argument("--dry", action="store_true", help="print only")
     args = parser.parse_intermixed_args()
     for row in globals()[args.bench](args):

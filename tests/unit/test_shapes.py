@@ -223,6 +223,17 @@ def test_given_places_and_faults() -> None:
         place_fibers(bed(1, 2, Shape(kind="u", angle=90.0)))
 
 
+def test_own_image_draws_another_direction() -> None:
+    """S fibers nearly as long as the box meet their own image along x: those turn away, all fit."""
+    shape = Shape(kind="s", curvature=20.0)
+    along_x = [0.9, 0.08, 0.02, 0.0, 0.0, 0.0]
+    placed = place_fibers(bed(8, 26, shape, orientation=along_x))
+    nodes = placed.node_pos.reshape(8, 27, 3)
+    across = nodes[:, -1] - nodes[:, 0]
+    touch = np.linalg.norm(across - [0.06, 0.0, 0.0], axis=1)
+    assert np.all(touch > DIAMETER)
+
+
 def test_check_tells_the_feret_diameter() -> None:
     lines = check_lines(bed(5, 26, Shape(kind="s", curvature=100.0)))
     told = [line for line in lines if line.startswith("maximum Feret diameter")]

@@ -80,8 +80,10 @@ class BondedContacts:
         """What the plain sweeps hand from one to the next."""
         p, device = self.model.precision, self.model.device
         size, nodes = self.search.list.pair_capacity, self.model.node_count
+        self.loads = wp.zeros(size, dtype=wp.uint8, device=device)  # PUSH, BESIDE, BOTH or 0
+        self.pair_hit = wp.zeros(size, dtype=wp.int32, device=device)  # of those with loads
+        # by hit, which lie beside each other
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
-        self.bends = wp.zeros(size, dtype=wp.uint8, device=device)  # acts beside a contact
         self.beside = wp.zeros(size, dtype=p.mat33, device=device)
         self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
         self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)

@@ -80,7 +80,7 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         spheres.place,
         state.status,
         contacts.acts,
-        contacts.bends,
+        contacts.loads,
         *hits,
     ]
     near = Launch("hits", make_capsule_hits(p.name, contacts.features), parts, inputs, split=True)
@@ -108,9 +108,10 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         contacts.acts,
         contacts.push,
         contacts.force,
-        contacts.moment,
         contacts.arms,
-        contacts.bends,
+        contacts.loads,
+        contacts.pair_hit,
+        contacts.moment,
         contacts.beside,
         contacts.memory,
         contacts.written,
@@ -126,14 +127,14 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     model, state, p = spheres.model, spheres.state, spheres.model.precision
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
-    gathered: list[Any] = [*[none_i] * 5, spheres.pair_acts, none_3, none_3]
-    kinds = (p.vec4, wp.uint8, p.mat33, wp.int32, p.vec3, p.vec3)
+    gathered: list[Any] = [*[none_i] * 5, none_3]
+    kinds = (p.vec4, wp.uint8, wp.int32, p.vec3, p.mat33, wp.int32, p.vec3, p.vec3)
     gathered += [wp.zeros(0, dtype=kind, device=model.device) for kind in kinds]
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts
         gathered = [pairs.out_start, pairs.in_start, pairs.in_pair, pairs.pair_i, pairs.pair_j]
-        gathered += [contacts.acts, contacts.force, contacts.moment, contacts.arms]
-        gathered += [contacts.bends, contacts.beside]
+        gathered += [contacts.force, contacts.arms, contacts.loads]
+        gathered += [contacts.pair_hit, contacts.moment, contacts.beside]
         gathered += [contacts.acting, contacts.node_force, contacts.node_moment]
     inputs = [
         p.real(spheres.dt),

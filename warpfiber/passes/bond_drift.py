@@ -10,6 +10,7 @@ import warp as wp
 
 from warpfiber.laws.rotation import make_rotation
 from warpfiber.model import EXPIRED, HALT, precision
+from warpfiber.passes.array_items import make_items
 from warpfiber.passes.kernel_module import FUSED
 
 
@@ -21,6 +22,9 @@ def make_bond_drift(name: str):
     turned = make_rotation(name)
     is_single = name == "float32"
     zero, half = real(0.0), real(0.5)
+    point, set_point = make_items(wp.vec3d)
+    vector, set_vector = make_items(vec3)
+    four, set_four = make_items(vec4)
 
     @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def bond_drift(
@@ -44,16 +48,16 @@ def make_bond_drift(name: str):
         kick = half * dt
         furthest = zero
         for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1]):
-            v = node_velocity[i] + kick * node_rate[i]
-            w = node_spin[i] + kick * node_spin_rate[i]
-            x = place[i] + wp.vec3d(dt * v)
-            node_velocity[i] = v
-            node_spin[i] = w
-            node_turn[i] = turned(node_turn[i], w, dt)
-            place[i] = x
+            v = vector(node_velocity, i) + kick * vector(node_rate, i)
+            w = vector(node_spin, i) + kick * vector(node_spin_rate, i)
+            x = point(place, i) + wp.vec3d(dt * v)
+            set_vector(node_velocity, i, v)
+            set_vector(node_spin, i, w)
+            set_four(node_turn, i, turned(four(node_turn, i), w, dt))
+            set_point(place, i, x)
             if wp.static(is_single):
                 node_pos_out[i] = vec3(x)
-            moved = wp.length(vec3(x) - list_pos[i]) + dt * wp.length(v)
+            moved = wp.length(vec3(x) - vector(list_pos, i)) + dt * wp.length(v)
             furthest = wp.max(furthest, moved)
         if not (furthest <= half * list_sizes[1]):
             status[wp.static(EXPIRED)] = 1

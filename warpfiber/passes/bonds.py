@@ -15,6 +15,7 @@ import warp as wp
 from warpfiber.laws.bond import make_bond
 from warpfiber.laws.rotation import make_rotation
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
+from warpfiber.passes.array_items import make_items
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.capsule_pairs import make_gather
 from warpfiber.passes.kernel_module import FUSED
@@ -74,6 +75,10 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     has_grips = features.grips
     is_single = name == "float32"
     zero, half, one = real(0.0), real(0.5), real(1.0)
+    point, set_point = make_items(wp.vec3d)
+    vector, set_vector = make_items(vec3)
+    turn, set_turn = make_items(vec4)
+    scalar, _ = make_items(real)
 
     @wp.func
     def arrived(
@@ -88,13 +93,13 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     ) -> Node:
         """The node after the first half kick and the drift."""
         node = Node()
-        node.x = place[i]
-        node.v = node_velocity[i]
-        node.q = node_turn[i]
-        node.w = node_spin[i]
+        node.x = point(place, i)
+        node.v = vector(node_velocity, i)
+        node.q = turn(node_turn, i)
+        node.w = vector(node_spin, i)
         if wp.static(drifts):
-            node.v += (half * dt) * node_rate[i]
-            node.w += (half * dt) * node_spin_rate[i]
+            node.v += (half * dt) * vector(node_rate, i)
+            node.w += (half * dt) * vector(node_spin_rate, i)
             node.x += wp.vec3d(dt * node.v)
             node.q = turned(node.q, node.w, dt)
         return node
@@ -137,12 +142,12 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         in_pair: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
-        pair_bends: wp.array(dtype=wp.uint8),
-        pair_beside: wp.array(dtype=mat33),
+        pair_loads: wp.array(dtype=wp.uint8),
+        pair_hit: wp.array(dtype=wp.int32),
+        hit_moment: wp.array(dtype=vec3),
+        hit_beside: wp.array(dtype=mat33),
         pair_acting: wp.array(dtype=wp.int32),
         contact_force: wp.array(dtype=vec3),
         contact_moment: wp.array(dtype=vec3),
@@ -186,12 +191,12 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 in_pair,
                 pair_i,
                 pair_j,
-                pair_acts,
                 pair_force,
-                pair_moment,
                 pair_arms,
-                pair_bends,
-                pair_beside,
+                pair_loads,
+                pair_hit,
+                hit_moment,
+                hit_beside,
                 pair_acting,
                 contact_force,
                 contact_moment,
@@ -229,7 +234,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                     i + 1, dt, place, node_velocity, node_turn, node_spin, node_rate, node_spin_rate
                 )
                 pull, moment_i, moment_j, length2 = bond_between(
-                    g, bond_axis[i], bond_length[i], node, after
+                    g, vector(bond_axis, i), scalar(bond_length, i), node, after
                 )
                 force += pull
                 moment += moment_i
@@ -241,10 +246,10 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 if not (length2 < torn2):
                     torn = 1
             if wp.static(has_pairs):
-                force += contact_force[i]
-                moment += contact_moment[i]
-                contact_force[i] = nothing
-                contact_moment[i] = nothing
+                force += vector(contact_force, i)
+                moment += vector(contact_moment, i)
+                set_vector(contact_force, i, nothing)
+                set_vector(contact_moment, i, nothing)
 
             mass = g.mass
             inertia = g.inertia
@@ -294,10 +299,10 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 if hold >= wp.static(CLAMPED):
                     spin_rate = nothing
                     w = nothing
-            node_rate[i] = rate
-            node_spin_rate[i] = spin_rate
-            node_velocity[i] = v
-            node_spin[i] = w
+            set_vector(node_rate, i, rate)
+            set_vector(node_spin_rate, i, spin_rate)
+            set_vector(node_velocity, i, v)
+            set_vector(node_spin, i, w)
             if wp.static(drifts):
                 place[i] = node.x
                 node_turn[i] = node.q

@@ -11,6 +11,7 @@ from functools import cache
 import warp as wp
 
 from warpfiber.model import HALT, PAIR_COUNT, precision
+from warpfiber.passes.array_items import make_items
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
@@ -37,6 +38,10 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
     is_closed = features.closed
+    number, set_number = make_items(wp.int32)
+    point, _ = make_items(wp.vec3d)
+    _, set_flag = make_items(wp.uint8)
+    _, set_closest = make_items(vec2)
 
     @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def capsule_hits(
@@ -52,7 +57,7 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
         place: wp.array(dtype=wp.vec3d),
         status: wp.array(dtype=wp.int32),
         pair_acts_out: wp.array(dtype=wp.uint8),
-        pair_bends_out: wp.array(dtype=wp.uint8),
+        pair_loads_out: wp.array(dtype=wp.uint8),
         hit_pair_out: wp.array(dtype=wp.int32),
         hit_closest_out: wp.array(dtype=vec2),
         hit_count_out: wp.array(dtype=wp.int32),
@@ -64,26 +69,26 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
         end = part_begin(part + 1, parts, status[wp.static(PAIR_COUNT)])
         found = begin
         for k in range(begin, end):
-            i = pair_i[k]
-            j = pair_j[k]
-            node_i = segment_node[i]
-            node_j = segment_node[j]
+            i = number(pair_i, k)
+            j = number(pair_j, k)
+            node_i = number(segment_node, i)
+            node_j = number(segment_node, j)
             end_i = node_i + 1
             end_j = node_j + 1
             if wp.static(is_closed):
-                end_i = segment_end[i]
-                end_j = segment_end[j]
-            xi = place[node_i]
-            xj = place[node_j]
-            a = vec3(place[end_i] - xi)
-            b = vec3(place[end_j] - xj)
-            delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
+                end_i = number(segment_end, i)
+                end_j = number(segment_end, j)
+            xi = point(place, node_i)
+            xj = point(place, node_j)
+            a = vec3(point(place, end_i) - xi)
+            b = vec3(point(place, end_j) - xj)
+            delta = vec3(xj - xi) + image_shift(number(pair_image, k), lattice[0])
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
-            pair_acts_out[k] = wp.uint8(0)
-            pair_bends_out[k] = wp.uint8(0)
-            hit_pair_out[found] = k
-            hit_closest_out[found] = st
+            set_flag(pair_acts_out, k, wp.uint8(0))
+            set_flag(pair_loads_out, k, wp.uint8(0))
+            set_number(hit_pair_out, found, k)
+            set_closest(hit_closest_out, found, st)
             found += wp.where(wp.length_sq(c) < largest_reach * largest_reach, 1, 0)
         hit_count_out[part] = found - begin
 

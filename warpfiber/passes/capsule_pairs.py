@@ -15,6 +15,7 @@ import warp as wp
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, PAIR_COUNT, precision
+from warpfiber.passes.array_items import make_items
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_hits import part_begin
@@ -23,6 +24,9 @@ from warpfiber.passes.contact_memory import make_hand_over
 from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
+
+# What a pair does to its nodes, 0 for nothing: a push with friction, loads beside it, both.
+PUSH, BESIDE, BOTH = wp.uint8(1), wp.uint8(2), wp.uint8(3)
 
 
 @cache
@@ -40,6 +44,14 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     has_dashpot, has_friction = features.dashpot, features.friction
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
+    number, set_number = make_items(wp.int32)
+    point, _ = make_items(wp.vec3d)
+    vector, set_vector = make_items(vec3)
+    pair_of, _ = make_items(vec2)
+    _, set_four = make_items(vec4)
+    _, set_nine = make_items(mat33)
+    _, set_real = make_items(real)
+    _, set_flag = make_items(wp.uint8)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -60,8 +72,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
     ):
         """Velocity and spin at the part s of the segment that begins with a node."""
-        v = (one - s) * node_velocity[node] + s * node_velocity[end]
-        w = (one - s) * node_spin[node] + s * node_spin[end]
+        v = (one - s) * vector(node_velocity, node) + s * vector(node_velocity, end)
+        w = (one - s) * vector(node_spin, node) + s * vector(node_spin, end)
         return v, w
 
     @wp.func
@@ -104,10 +116,11 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
-        pair_moment_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
-        pair_bends: wp.array(dtype=wp.uint8),
-        pair_beside_out: wp.array(dtype=mat33),
+        pair_loads: wp.array(dtype=wp.uint8),
+        pair_hit_out: wp.array(dtype=wp.int32),
+        hit_moment_out: wp.array(dtype=vec3),
+        hit_beside_out: wp.array(dtype=mat33),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -117,25 +130,25 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         part = wp.tid() + offset
         begin = part_begin(part, parts, status[wp.static(PAIR_COUNT)])
         for hit in range(begin, begin + hit_count[part]):
-            k = hit_pair[hit]
-            st = hit_closest[hit]
-            i = pair_i[k]
-            j = pair_j[k]
-            node_i = segment_node[i]
-            node_j = segment_node[j]
-            fiber_i = segment_fiber[i]
-            fiber_j = segment_fiber[j]
-            gi = groups[fiber_group[fiber_i]]
-            gj = groups[fiber_group[fiber_j]]
-            at_i = node_i - fiber_node_start[fiber_i]
-            at_j = node_j - fiber_node_start[fiber_j]
+            k = number(hit_pair, hit)
+            st = pair_of(hit_closest, hit)
+            i = number(pair_i, k)
+            j = number(pair_j, k)
+            node_i = number(segment_node, i)
+            node_j = number(segment_node, j)
+            fiber_i = number(segment_fiber, i)
+            fiber_j = number(segment_fiber, j)
+            gi = groups[number(fiber_group, fiber_i)]
+            gj = groups[number(fiber_group, fiber_j)]
+            at_i = node_i - number(fiber_node_start, fiber_i)
+            at_j = node_j - number(fiber_node_start, fiber_j)
             end_i = node_after(node_i, at_i, ring_of(gi))
             end_j = node_after(node_j, at_j, ring_of(gj))
-            xi = place[node_i]
-            xj = place[node_j]
-            a = vec3(place[end_i] - xi)
-            b = vec3(place[end_j] - xj)
-            delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
+            xi = point(place, node_i)
+            xj = point(place, node_j)
+            a = vec3(point(place, end_i) - xi)
+            b = vec3(point(place, end_j) - xj)
+            delta = vec3(xj - xi) + image_shift(number(pair_image, k), lattice[0])
             c = delta + st[1] * b - st[0] * a
             reach = gi.radius + gj.radius
             if wp.length_sq(c) >= reach * reach:
@@ -143,9 +156,11 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             push, depth, _energy, beside = normal_contact(
                 gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
             )
-            if wp.ddot(beside, beside) > zero:
-                pair_bends[k] = wp.uint8(1)
-                pair_beside_out[k] = beside
+            has_beside = wp.ddot(beside, beside) > zero
+            if has_beside:
+                set_flag(pair_loads, k, wp.static(BESIDE))
+                set_nine(hit_beside_out, hit, beside)
+                set_number(pair_hit_out, k, hit)
             if push[0] <= zero:
                 continue
             s = push[2]
@@ -179,7 +194,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                         kept = neighbors_memory(
                             i,
                             j,
-                            pair_image[k],
+                            number(pair_image, k),
                             last,
                             s,
                             t,
@@ -201,11 +216,13 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now
             force -= size * n
-            pair_acts[k] = wp.uint8(1)
-            pair_push_out[k] = push[0]
-            pair_force_out[k] = force
-            pair_moment_out[k] = wp.cross(n, force)
-            pair_arms_out[k] = vec4(s, t, arm_i, arm_j)
+            set_flag(pair_acts, k, wp.uint8(1))
+            set_flag(pair_loads, k, wp.where(has_beside, wp.static(BOTH), wp.static(PUSH)))
+            set_real(pair_push_out, k, push[0])
+            set_vector(pair_force_out, k, force)
+            set_number(pair_hit_out, k, hit)
+            set_vector(hit_moment_out, hit, wp.cross(n, force))
+            set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
 
     return capsule_pairs
 
@@ -220,6 +237,11 @@ def make_gather(name: str, closed: bool):
     p = precision(name)
     real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     one = real(1.0)
+    number, set_number = make_items(wp.int32)
+    vector, set_vector = make_items(vec3)
+    four, _ = make_items(vec4)
+    nine, _ = make_items(mat33)
+    flag, _ = make_items(wp.uint8)
 
     @wp.func
     def gather_pairs(
@@ -232,12 +254,12 @@ def make_gather(name: str, closed: bool):
         in_pair: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
-        pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
-        pair_moment: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
-        pair_bends: wp.array(dtype=wp.uint8),
-        pair_beside: wp.array(dtype=mat33),
+        pair_loads: wp.array(dtype=wp.uint8),
+        pair_hit: wp.array(dtype=wp.int32),
+        hit_moment: wp.array(dtype=vec3),
+        hit_beside: wp.array(dtype=mat33),
         acting: wp.array(dtype=wp.int32),
         node_force: wp.array(dtype=vec3),
         node_moment: wp.array(dtype=vec3),
@@ -245,44 +267,49 @@ def make_gather(name: str, closed: bool):
         begin = out_start[first_segment] + in_start[first_segment]
         found = begin
         for k in range(out_start[first_segment], out_start[end_segment]):
-            acting[found] = k
-            found += wp.int32(pair_acts[k] | pair_bends[k])
+            set_number(acting, found, k)
+            found += wp.where(flag(pair_loads, k) != wp.uint8(0), 1, 0)
         incoming = found
         for slot in range(in_start[first_segment], in_start[end_segment]):
-            k = in_pair[slot]
-            acting[found] = k
-            found += wp.int32(pair_acts[k] | pair_bends[k])
+            k = number(in_pair, slot)
+            set_number(acting, found, k)
+            found += wp.where(flag(pair_loads, k) != wp.uint8(0), 1, 0)
         for slot in range(begin, found):
-            k = acting[slot]
-            segment = pair_i[k]
+            k = number(acting, slot)
+            segment = number(pair_i, k)
             if slot >= incoming:
-                segment = pair_j[k]
+                segment = number(pair_j, k)
             node = first + segment - first_segment
             end = node + 1
             if wp.static(closed):
                 if node == last:
                     end = first
-            if pair_acts[k] != wp.uint8(0):
-                arms = pair_arms[k]
-                force = pair_force[k]
+            loads = flag(pair_loads, k)
+            if loads != wp.static(BESIDE):
+                arms = four(pair_arms, k)
+                force = vector(pair_force, k)
                 part = arms[0]
                 arm = arms[2]
                 if slot >= incoming:
                     force = -force
                     part = arms[1]
                     arm = arms[3]
-                moment = arm * pair_moment[k]
-                node_force[node] += (one - part) * force
-                node_moment[node] += (one - part) * moment
-                node_force[end] += part * force
-                node_moment[end] += part * moment
-            if pair_bends[k] != wp.uint8(0):
-                beside = pair_beside[k]
+                moment = arm * vector(hit_moment, number(pair_hit, k))
+                set_vector(node_force, node, vector(node_force, node) + (one - part) * force)
+                set_vector(node_moment, node, vector(node_moment, node) + (one - part) * moment)
+                set_vector(node_force, end, vector(node_force, end) + part * force)
+                set_vector(node_moment, end, vector(node_moment, end) + part * moment)
+            if loads != wp.static(PUSH):
+                beside = nine(hit_beside, number(pair_hit, k))
                 if slot < incoming:
-                    node_force[node] += beside[0]
-                    node_force[end] += beside[1]
+                    set_vector(node_force, node, vector(node_force, node) + beside[0])
+                    set_vector(node_force, end, vector(node_force, end) + beside[1])
                 else:
-                    node_force[node] += beside[2]
-                    node_force[end] -= beside[0] + beside[1] + beside[2]
+                    set_vector(node_force, node, vector(node_force, node) + beside[2])
+                    set_vector(
+                        node_force,
+                        end,
+                        vector(node_force, end) - (beside[0] + beside[1] + beside[2]),
+                    )
 
     return gather_pairs

@@ -258,7 +258,12 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False, clos
         is_i1 = (one - st[0]) * la < patch
         is_j0 = st[1] * lb < patch
         is_j1 = (one - st[1]) * lb < patch
-        if not (is_i0 or is_i1 or is_j0 or is_j1):
+        # where the nearest point is a node, the distance rises from there along its segment
+        is_past_i0 = is_i0 and st[0] > near
+        is_past_i1 = is_i1 and one - st[0] > near
+        is_past_j0 = is_j0 and st[1] > near
+        is_past_j1 = is_j1 and one - st[1] > near
+        if not (is_past_i0 or is_past_i1 or is_past_j0 or is_past_j1):
             return less, mat33()
         ring_i = gi.closed * (gi.segments + 1)
         ring_j = gj.closed * (gj.segments + 1)
@@ -281,7 +286,7 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False, clos
         if after_j:
             second = node_after(node_j, at_j, ring_j)
             ahead_j = node_pos[node_beyond(node_j, at_j, ring_j)] - node_pos[second]
-        if is_i0 and before_i:
+        if is_past_i0 and before_i:
             pull, part, depths = saddle(
                 start, a, back_i, delta, b, back_j, before_j, after_j, reach
             )
@@ -289,13 +294,13 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False, clos
             u0 += pull
             w0 -= (one - part) * pull
             w1 -= part * pull
-        if is_i1 and after_i:
+        if is_past_i1 and after_i:
             pull, part, depths = saddle(a, -a, ahead_i, delta, b, back_j, before_j, after_j, reach)
             less += depths
             u1 += pull
             w0 -= (one - part) * pull
             w1 -= part * pull
-        if is_j0 and before_j:
+        if is_past_j0 and before_j:
             pull, part, depths = saddle(
                 delta, b, back_j, start, a, back_i, before_i, after_i, reach
             )
@@ -303,7 +308,7 @@ def make_capsule_touch(name: str, periodic: bool, has_energy: bool = False, clos
             w0 += pull
             u0 -= (one - part) * pull
             u1 -= part * pull
-        if is_j1 and after_j:
+        if is_past_j1 and after_j:
             pull, part, depths = saddle(
                 delta + b, -b, ahead_j, start, a, back_i, before_i, after_i, reach
             )

@@ -313,7 +313,7 @@ NORMAL = """
                 summit(l, end - u, -u, after_i, -w, after_j, beside_i1, beside_j1);
         }
     }
-    M saddled = less > T(0);
+    M saddled = less != T(0);  // less than nothing where a maximum is deeper than the saddles
     if (any(~reject | saddled)) {
         const V total = ki + kj;
         V sum = end_i ? ki + total : total, product = end_i ? ki * total : ki * kj * sine * sine;

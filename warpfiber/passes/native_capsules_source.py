@@ -1,9 +1,10 @@
 """C++ text of the SIMD sweep over listed pairs of bonded spheres (`native_capsules`).
 
-Distances of LANES near pairs at a time; pairs within reach are collected, those that are aligned
-apart, and have the law of contact LANES at a time, normal (`native_capsule_law`) and tangential as
-in `capsule_pairs` and `friction`. What waits for its law is fetched into the cache meanwhile. A
-memory that must be handed over is looked for pair by pair: that is rare.
+Distances of LANES near pairs at a time; pairs that may have a load are collected, those that are
+aligned apart (`native_capsule_hits`), and have the law of contact LANES at a time, normal
+(`native_capsule_law`) and tangential as in `capsule_pairs` and `friction`. What waits for its law
+is fetched into the cache meanwhile. A memory that must be handed over is looked for pair by pair:
+that is rare.
 Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list, `at` among near pairs.
 """
 

@@ -7,7 +7,8 @@ Source: random sequential addition, as in `insertion`: voxels reject most center
     neighbors of the rest. A fiber is free if each of its segments is.
 Symbols: n segments per fiber.
 Limits: moderate crowding; fibers are not pushed apart. A fiber may touch, not overlap, its own
-    periodic image. Report of overlaps: the closing segment of a ring is not in it.
+    periodic image; if it does at every turn, its direction is drawn again. Report of overlaps: the
+    closing segment of a ring is not in it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ TRIES = 64
 """Centers tried at once for one fiber."""
 ROUNDS = 1000
 """Times that a fiber gets another turn about its direction and new centers."""
+REDRAWS = 20
+"""Directions for a fiber that overlaps its own periodic image at every turn about the first."""
 
 
 def insert_shaped(
@@ -57,6 +60,11 @@ def insert_shaped(
     places = _Places(scene, cell, group, shape, held)
     for f in range(group.count):
         nodes = places.place(direction[f], None if given is None else given[f], rng)
+        for _ in range(REDRAWS):
+            if nodes is not None or not places.meets_image or group.orientation == "aligned":
+                break
+            again = draw_directions(tensor, 1, rng, group.orientation_law)[0]
+            nodes = places.place(again, None if given is None else given[f], rng)
         if nodes is None:
             if given is not None:
                 where = tuple(float(x) for x in given[f])
@@ -94,6 +102,7 @@ class _Places:
         self.closed = group.shape.kind == "ring"
         self.apart = scene.contact.law != "none"
         self.tries = 0
+        self.meets_image = False
         self.crowd: Crowd | None = None
         self.inserted: list[Capsules] = list(held)
         if cell.size is not None:
@@ -112,7 +121,7 @@ class _Places:
         self, direction: Floats, given: Floats | None, rng: np.random.Generator
     ) -> Floats | None:
         """Nodes (n, 3) m of a fiber that is free of the others, now one of them; or None."""
-        self.tries = 0
+        self.tries, self.meets_image = 0, True
         for _ in range(ROUNDS):
             turned = self.shape @ _frame(direction, 2.0 * math.pi * rng.random())
             center = self._centers(turned, given, rng)
@@ -170,6 +179,7 @@ class _Places:
         )
         if len(own.i):  # whatever the center, it overlaps its own image
             return None
+        self.meets_image = False
         crowd = self.crowd
         if crowd is None:
             new = self.segments(turned[None] + center[:1, None])

@@ -1,0 +1,87 @@
+"""Pairs of bonded spheres whose law vectors leave out: none of them has a load.
+
+Bound: as of the pair sweeps in `test_native_bonds`, of the largest force; sums are in another
+order, and powers are by series.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.bonded_crowd import RADIUS, crowd
+from tests.unit.test_native_bonds import PAIR_BOUND
+from warpfiber.methods.bonded_launches import pair_launches
+from warpfiber.passes.capsule_pairs import BESIDE, PUSH
+from warpfiber.passes.executor import load_kernels
+from warpfiber.passes.native_capsules_source import LINE, PARTS
+
+
+def kinked(precision: str, seed: int) -> Any:
+    """Method of a crowd whose nodes are moved at random: kinks everywhere, hollows in many."""
+    sim = crowd(precision)
+    sim.prepare()
+    method: Any = sim.method
+    unit = sim.model.units.length
+    moves = np.random.default_rng(seed).normal(size=(sim.model.node_count, 3)) * 0.25 * RADIUS
+    method.place.assign(method.place.numpy() + moves / unit)
+    if method.place is not sim.state.node_pos:
+        sim.state.node_pos.assign(method.place.numpy().astype(np.float32))
+    method.rebuild_list()
+    method.contacts.allocate_scratch()
+    return sim
+
+
+def plain_loads(sim: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Forces on nodes by the plain sweeps, pair by pair, and the marks of pairs."""
+    method = sim.method
+    launches = pair_launches(method, 0.0)
+    load_kernels([launch.kernel for launch in launches], "cpu")
+    for launch in launches:
+        launch.run("cpu")
+    contacts = method.contacts
+    i, j, _ = method.list.host_pairs()
+    node = sim.model.segment_node.numpy()
+    hits, marks = contacts.pair_hit.numpy(), contacts.loads.numpy()[: len(i)]
+    loads = np.zeros((sim.model.node_count, 3))
+    for k in np.flatnonzero(marks):
+        first = node[i[k]], node[j[k]]
+        if marks[k] != int(BESIDE):
+            force = contacts.force.numpy()[k].astype(float)
+            s, t = contacts.arms.numpy()[k][:2].astype(float)
+            for at, part, on in zip(first, (s, t), (force, -force), strict=True):
+                loads[at : at + 2] += np.array([[1.0 - part], [part]]) * on
+        if marks[k] != int(PUSH):
+            rows = contacts.beside.numpy()[hits[k]].astype(float)
+            loads[first[0] : first[0] + 2] += rows[:2]
+            loads[first[1]] += rows[2]
+            loads[first[1] + 1] -= rows.sum(axis=0)
+    return loads, marks
+
+
+def vector_loads(sim: Any) -> np.ndarray:
+    """The same by vectors."""
+    native, nodes = sim.method.native, sim.model.node_count
+    native.contact_touch.zero_()
+    launch = native.pair_launch(0.0)
+    load_kernels([launch.kernel], "cpu")
+    launch.run("cpu")
+    lines = native.contact_load.numpy().reshape(-1, LINE)[1:].reshape(PARTS, nodes, LINE)
+    touched = native.contact_touch.numpy().reshape(PARTS, nodes, 1) != 0
+    total: np.ndarray = np.where(touched, lines, 0.0).sum(axis=0)
+    return total[:, :3].astype(float)
+
+
+@pytest.mark.parametrize("precision", PAIR_BOUND)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_loads(precision: str, seed: int) -> None:
+    """Forces of nodes, many of them by pairs that have no contact of their own."""
+    sim = kinked(precision, seed)
+    expected, marks = plain_loads(sim)
+    assert (marks == int(BESIDE)).sum() > 5
+    assert (marks != 0).sum() > 60
+    found = vector_loads(sim)
+    assert np.abs(found - expected).max() < PAIR_BOUND[precision] * np.abs(expected).max()
+    sim.close()
