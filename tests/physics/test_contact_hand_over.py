@@ -13,6 +13,9 @@ from warpfiber.simulation import Simulation
 
 RADIUS, STEP = 1.2e-3, 2.4e-3
 DEPTH, SPEED, N = 1e-4, 0.1, 20
+# Pairs that share a patch rub across their own middles of it, up to sqrt(2 DEPTH / 2 RADIUS) askew;
+# half of its square, and no part of a patch is that far from its middle on average.
+TILT = 0.25 * DEPTH / RADIUS
 
 
 def dragged(
@@ -65,11 +68,11 @@ def pulls(sim: Simulation, steps: int, every: int) -> np.ndarray:
     ],
 )
 def test_sliding_over_nodes(velocity: list[float], step: float) -> None:
-    """mu times a constant normal force over nodes of both fibers; k eps of coordinates of 0.5 m."""
+    """mu times a constant normal force over nodes of both fibers; see TILT."""
     sim = dragged(90.0, 0.3, velocity, 0.2, step)
     _, normal, drag = pulls(sim, 4000, 7)[:, 30:]  # 8 mm, without the first sticking
-    assert np.ptp(normal) < 1e-9 * normal[0]
-    assert np.abs(drag / normal - 0.3).max() < 1e-9
+    assert np.ptp(normal) < TILT * normal[0]
+    assert np.abs(drag / normal - 0.3).max() < 0.3 * TILT
 
 
 @pytest.mark.parametrize("velocity", [[SPEED, 0.0, 0.0], [0.8 * SPEED, -0.6 * SPEED, 0.0]])
@@ -79,7 +82,7 @@ def test_sticking_over_a_node(part: float, velocity: list[float]) -> None:
     sim = dragged(90.0, 100.0, velocity, part)
     step, normal, drag = pulls(sim, 60, 1)  # 0.12 mm; the node is 0.048 mm away
     slope = drag / normal / step
-    assert np.ptp(slope) < 1e-9 * slope[0]
+    assert np.ptp(slope) < TILT * slope[0]
 
 
 @pytest.mark.parametrize("degrees", [25.0, 8.0])

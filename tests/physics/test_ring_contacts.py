@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.physics.test_contact_hand_over import TILT
 from tests.reference import bonded_spheres as ref
 from tests.rods import rates, start_rods
 from warpfiber.simulation import Simulation
@@ -153,7 +154,7 @@ def dragged(first: int, velocity: list[float], friction: float) -> Simulation:
 
 
 def pushes(sim: Simulation) -> np.ndarray:
-    """Sum over the contacts of all listed pairs and what hollows take off them, in run units."""
+    """Sum over the contacts of all listed pairs, in run units."""
     contacts = sim.method.contacts  # type: ignore[attr-defined]
     count = sim.method.list.pair_count  # type: ignore[union-attr]
     acts = contacts.acts.numpy()[:count] != 0
@@ -168,7 +169,7 @@ def pushes(sim: Simulation) -> np.ndarray:
 @pytest.mark.parametrize("first", [0, 5, 6])
 @pytest.mark.parametrize("speed", [0.1, -0.1])
 def test_drag_over_the_closure(first: int, speed: float) -> None:
-    """mu times a constant normal force, also over the closing segment; k eps of 0.5 m."""
+    """mu times a constant normal force, also over the closing segment; see TILT."""
     sim = dragged(first, [speed, 0.0, 0.0], 0.3)
     found, builds = [], 0
     for _ in range(400):
@@ -179,8 +180,8 @@ def test_drag_over_the_closure(first: int, speed: float) -> None:
     push = np.asarray(found)[30:]
     normal, drag = np.abs(push[:, 2]), np.hypot(push[:, 0], push[:, 1])
     assert normal[0] > 0.0
-    assert np.ptp(normal) < 1e-9 * normal[0]
-    assert np.abs(drag / normal - 0.3).max() < 1e-9
+    assert np.ptp(normal) < TILT * normal[0]
+    assert np.abs(drag / normal - 0.3).max() < 0.3 * TILT
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -207,7 +208,7 @@ def test_pairs() -> None:
 def test_rest() -> None:
     """A ring that came to rest on a held one: its contacts carry its weight on average.
 
-    Where nodes lie on nodes contacts change between points and lines: 4 standard errors.
+    4 standard errors, and what is left of its motion.
     """
     row = {
         "diameter": 2.0 * RADIUS,
@@ -235,9 +236,11 @@ def test_rest() -> None:
         sim.step(20)
         found.append(abs(pushes(sim)[2]) * sim.model.units.force)
     blocks = np.reshape(found, (10, 20)).mean(axis=1)
-    weight = 200.0 * N * rods[1].mass[0]
+    arc = math.pi / N / math.sin(math.pi / N)  # a ring weighs what its circle does
+    weight = 200.0 * N * rods[1].mass[0] * arc
     scatter = blocks.std(ddof=1) / math.sqrt(10.0)
-    assert abs(blocks.mean() - weight) < 4.0 * scatter < 0.1 * weight
+    assert abs(blocks.mean() - weight) < 4.0 * scatter + 1e-6 * weight
+    assert scatter < 1e-3 * weight
     assert np.ptp(sim.node_pos[N:, 2]) < 1e-5
 
 

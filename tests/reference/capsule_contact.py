@@ -1,9 +1,9 @@
-"""Contact of sphero-cylinders in float64 NumPy: all pairs, curvature tensors, quadrature, memories.
+"""Contact of sphero-cylinders in float64 NumPy: all pairs, quadrature, complex steps, memories.
 
-Source: elliptic Hertz contacts from the sum of two curvature tensors; along a line where fibers are
-    within 30 degrees of each other and the patch is longer than half a segment; the vertex rule;
-    in the hollow of a kink minima less saddles plus maxima; Mindlin and Coulomb. Written with
-    eigenvalues and numerical integrals, where the kernels have closed forms.
+Source: energy of elliptic Hertz contacts in slices across the mean directions of two segments, or
+    across a segment beside the tip of the other; forces are derivatives by complex steps, where the
+    kernels have gradients in closed form, and no contact is taken at a point but that of two tips;
+    Mindlin and Coulomb.
 Symbols: x, v, w nodes of both fibers; s, t parts of the two segments; n from the first to the
     second; a memory is (displacement, overlap a step ago), and goes over to the next segment with
     the contact.
@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from tests.reference.bonded_spheres import Array, Rod
 from tests.reference.segments import closest_points
 
-NEAR = 1e-9
+STEP = 2.4e-3  # m, of segments
 Memory = tuple[Array, float]
 Memories = dict[tuple[int, int], Memory]
 
@@ -48,193 +50,222 @@ class Laws:
         return 4.0 * shear / (2.0 * (2.0 - self.poisson)) / self.effective
 
 
-def hertz(laws: Laws, tensors: list[Array], depth: float) -> tuple[float, float]:
-    """Force and stiffness of surfaces with these curvature tensors (2, 2) in one plane."""
-    small, large = np.linalg.eigvalsh(np.sum(tensors, axis=0))
+def product(a: Array, b: Array) -> Any:
+    """Scalar product without conjugation."""
+    return (a * b).sum(-1)
+
+
+def size(a: Array) -> Any:
+    """Length, analytic in complex numbers."""
+    return np.sqrt(product(a, a))
+
+
+def pick(a: Any, b: Any, largest: bool) -> Any:
+    """The larger or the smaller one by its real part; their mean where rounding would decide."""
+    if abs(a.real - b.real) < 1e-9 * STEP:
+        return 0.5 * (a + b)
+    return a if (a.real >= b.real) == largest else b
+
+
+def rounding(small: Any, large: Any) -> Any:
+    """sqrt(R*) F_2^-1.5 of the two principal relative curvatures."""
     correction = 1.0 - ((large / small) ** 0.0684 - 1.0) ** 1.531
-    root = (small * large) ** -0.25
-    force = 4.0 / 3.0 * laws.effective * root * depth**1.5 * correction**-1.5
-    return force, 1.5 * force / depth
+    return (small * large) ** -0.25 * correction**-1.5
 
 
-def per_angle(tensors: list[Array], angle: float) -> float:
-    """Logarithmic derivative of a contact's energy by the angle between two crossing cylinders."""
-    small, large = np.linalg.eigvalsh(np.sum(tensors, axis=0))
-    by_product = -0.25
-    if large > small:
-        power = (large / small) ** 0.0684
-        correction = 1.0 - (power - 1.0) ** 1.531
-        by_ratio = 1.5 / correction * 1.531 * (power - 1.0) ** 0.531 * 0.0684 * power
-        by_product -= by_ratio * (large + small) / (large - small)
-    return float(by_product * 2.0 / math.tan(angle))
-
-
-def curvature(radius: float, angle: float | None) -> Array:
-    """Of a cylinder whose axis has this angle in the plane; None: of a sphere."""
-    if angle is None:
-        return np.eye(2) / radius
-    across = np.array([-math.sin(angle), math.cos(angle)])
-    return np.outer(across, across) / radius
+def cylinder_rounding(ra: float, rb: float, sine: Any) -> Any:
+    """Of two cylinders, from the eigenvalues of the sum of their curvature tensors."""
+    middle, both = 0.5 * (1.0 / ra + 1.0 / rb), sine * sine / (ra * rb)
+    square = middle * middle - both
+    large = middle + (np.sqrt(square) if square.real > 0.0 else 0.0)
+    return rounding(both / large, large)
 
 
 @dataclass
 class Touch:
-    """What one pair of segments does: spring force, stiffness, and where.
+    """What one pair of segments does, and where."""
 
-    springs: (force, s, t) of all extrema that count; along a line there is none but the sum.
-    """
-
-    force: float
-    stiffness: float
-    s: float
-    t: float
+    energy: Any
+    stiffness: float = 0.0
+    damped: float = 0.0
+    s: float = 0.0
+    t: float = 0.0
     depth: float = 0.0
-    springs: list[tuple[float, float, float]] = field(default_factory=list)
-    energy: float = 0.0
-    twist: float = 0.0  # derivative of the energy by the angle from the first to the second
+    pulls: Array = field(default_factory=lambda: np.zeros((4, 3)))  # on its nodes
+    force: float = 0.0
+
+    def plus(self, other: Touch) -> Touch:
+        """Both ways of slicing together."""
+        energy = self.energy + other.energy
+        if energy.real <= 0.0:
+            return self
+        part = other.energy.real / energy.real
+        return Touch(
+            energy,
+            self.stiffness + other.stiffness,
+            self.damped + other.damped,
+            (1.0 - part) * self.s + part * other.s,
+            (1.0 - part) * self.t + part * other.t,
+            max(self.depth, other.depth),
+        )
 
 
-def line_touch(laws: Laws, delta: Array, a: Array, b: Array, ra: float, rb: float) -> Touch | None:
-    """Contact along a line; None where the pair of segments is to be taken as a point."""
-    la, lb = np.linalg.norm(a), np.linalg.norm(b)
-    cosine = abs(a @ b) / (la * lb)
-    if cosine <= math.cos(math.radians(30.0)):
-        return None
-    sine = max(float(np.linalg.norm(np.cross(a, b)) / (la * lb)), 0.02)
-    middle = a / la + math.copysign(1.0, a @ b) * b / lb
-    middle /= np.linalg.norm(middle)
+def sliced(
+    first: Array, slope: Array, low: Any, high: Any, beyond: Any, reach: float, rigidity: Any
+) -> tuple[Any, float, float, float, float, float]:
+    """Energy, stiffness, center, length, whole length and depth of slices first + z slope.
 
-    def gap(z: float | Array) -> Array:
-        """From a to b at the coordinate z along the mean direction."""
-        s = np.asarray(z) / (a @ middle)
-        t = (np.asarray(z) - delta @ middle) / (b @ middle)
-        return delta + np.multiply.outer(t, b) - np.multiply.outer(s, a)
-
-    zero, slope = gap(0.0), gap(1.0) - gap(0.0)
-    steep = slope @ slope
-    square = zero @ zero - (zero @ slope) ** 2 / steep if steep > 0.0 else zero @ zero
-    reach, least = ra + rb, math.sqrt(max(square, 0.0))
-    depth = reach - least
-    if depth < 0.0 or 2.0 * reach * depth < (0.25 * min(la, lb) * sine) ** 2:
-        return None
-    ends = sorted([delta @ middle, (delta + b) @ middle])
-    low, high = max(0.0, ends[0]), min(float(a @ middle), ends[1])
-    if low >= high:
-        return Touch(0.0, 0.0, 0.0, 0.0)
+    beyond: between which z the deepest one counts; rigidity: E* sqrt(R*) F_2^-1.5 times the way
+    across per z.
+    """
+    nothing = (0.0 * low, 0.0, 0.0, 0.0, 1.0, 0.0)
+    if high.real - low.real <= 1e-9 * STEP:
+        return nothing
+    steep = product(slope, slope)
+    middle = -product(first, slope) / steep if steep.real > 1e-18 else 0.5 * (low + high)
+    z = pick(pick(middle, beyond[0], True), beyond[1], False)
+    least = size(first + z * slope)
+    if least.real >= reach:
+        return nothing
+    offset = product(first + z * slope, slope)
+    wide = np.sqrt(offset**2 + steep * (reach**2 - least**2)).real
+    span = (reach**2 - least**2).real
+    down = span / (wide - offset.real) if wide > offset.real else math.inf
+    up = span / (wide + offset.real) if wide > -offset.real else math.inf
+    low = low if z.real - down < low.real else z.real - down + 0.0 * low
+    high = high if z.real + up > high.real else z.real + up + 0.0 * high
+    if high.real - low.real <= 1e-9 * STEP:
+        return nothing
     nodes, weights = np.polynomial.legendre.leggauss(3)  # exact for what is integrated
-    if steep > 0.0:
-        center = -(zero @ slope) / steep
-        half = math.sqrt(max(reach**2 - square, 0.0) / steep)
-        low, high = max(low, center - half), min(high, center + half)
-        if low >= high:
-            return Touch(0.0, 0.0, 0.0, 0.0)
-    z = 0.5 * (low + high) + 0.5 * (high - low) * nodes
-    overlap = (reach**2 - (gap(z) ** 2).sum(1)) / (reach + least)
+    at = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+    gaps = first + at[:, None] * slope
+    overlap = reach**2 - product(gaps, gaps)
     weights = 0.5 * (high - low) * weights
-    integral = float(weights @ overlap)
-    # a whole patch of length 2 sqrt(2 reach delta) / sine has the force of Hertz
-    whole = 4.0 / 3.0 * math.sqrt(2.0 * reach) * depth**1.5 / sine
-    angle = math.asin(min(1.0, sine))
-    per_integral = hertz(laws, [curvature(ra, 0.0), curvature(rb, angle)], depth)[0] / whole
-    place = float(weights @ (overlap * z)) / integral
-    t = (place - delta @ middle) / (b @ middle)
-    # deepest along both, and a mean length of them further on each side
-    further = 0.5 * float(a @ middle + abs(b @ middle))
-    first, last = min(0.0, ends[0]) - further, max(float(a @ middle), ends[1]) + further
-    nearest = gap(min(max(-float(zero @ slope) / max(float(steep), 1e-30), first), last))
+    energy = 0.5 * rigidity * (reach + least) ** -2.5 * (weights * overlap**2).sum()
+    length = (high - low).real
+    stiffness = (rigidity * (reach + least) ** -0.5).real * length
+    center = ((weights * overlap * at).sum() / (weights * overlap).sum()).real
+    return energy, stiffness, center, length, down + up, float(reach - least.real)
+
+
+def sides(laws: Laws, x: Array, ra: float, rb: float, sign: float) -> Touch:
+    """Slices across the mean direction of the first segment and `sign` times the second."""
+    a, b = x[1] - x[0], x[3] - x[2]
+    u, w = a / size(a), sign * b / size(b)
+    cosine = product(u, w)
+    weight = 0.5 + cosine if abs(cosine.real) < 0.5 else 0.5 + 0.5 * np.sign(cosine.real)
+    if weight.real <= 0.0:
+        return Touch(0.0 * cosine)
+    middle = (u + w) / size(u + w)
+    sine = size(np.cross(u, w))
+    sine = sine if sine.real > 0.02 else 0.02 + 0.0 * sine
+    end, start, stop = (product(p - x[0], middle) for p in x[1:])
+
+    def gap(z: Any) -> Array:
+        """From the first axis to the second one in a slice."""
+        on_b: Array = x[2] + (z - start) / (stop - start) * b
+        return on_b - (x[0] + z / end * a)
+
+    nothing = 0.0 * end
+    bounds = pick(start, stop, False), pick(start, stop, True)
+    low, high = pick(nothing, bounds[0], True), pick(end, bounds[1], False)
+    zero = gap(nothing)
+    slope = gap(nothing + 1.0) - zero
+    stiff = cylinder_rounding(ra, rb, sine) * sine
+    rigidity = weight * laws.effective * (stiff if sine.real > 0.03 else stiff.real)
+    # deepest along both, and a quarter of their mean length further on each side
+    further = 0.125 * (end + pick(stop - start, start - stop, True))
+    beyond = (
+        pick(nothing, bounds[0], False) - further,
+        pick(end, bounds[1], True) + further,
+    )
+    energy, stiffness, center, length, whole, depth = sliced(
+        zero, slope, low, high, beyond, ra + rb, rigidity * 2.0 / (1.0 + cosine)
+    )
     return Touch(
-        per_integral * integral,
-        per_integral * (high - low),
-        place / float(a @ middle),
-        min(max(t, 0.0), 1.0),
-        reach - float(np.linalg.norm(nearest)),
+        energy,
+        stiffness,
+        stiffness * length / min(whole, 4.0 * further.real),
+        center / end.real,
+        ((center - start) / (stop - start)).real,
+        depth,
     )
 
 
-def descends(x: Array, vertex: int, towards: int, away: Array) -> bool:
-    """Whether a fiber comes nearer along its edge from a node; away: from the node to the other."""
-    edge = x[towards] - x[vertex]
-    return bool(away @ edge > NEAR * (edge @ edge))
+def both_sides(laws: Laws, x: Array, ra: float, rb: float) -> Touch:
+    """Slices across both mean directions."""
+    return sides(laws, x, ra, rb, 1.0).plus(sides(laws, x, ra, rb, -1.0))
 
 
-def extrema(
-    x: Array, i: int, j: int, first: tuple[int, int], last: tuple[int, int]
-) -> list[tuple[float, float, float]]:
-    """(weight, part of i, part of j): halves of saddles and quarters of maxima of two segments."""
-    found = []
-    for side, (segment, other) in enumerate(((i, j), (j, i))):
-        for k in (0, 1):
-            vertex, inner, beyond = segment + k, segment + 1 - k, segment + 3 * k - 1
-            if vertex in (first[side], last[side] + 1):
-                continue
-            _, there = closest_points(x[vertex], x[vertex], x[other], x[other + 1])
-            away = x[other] + there * (x[other + 1] - x[other]) - x[vertex]
-            if not (descends(x, vertex, inner, away) and descends(x, vertex, beyond, away)):
-                continue
-            if there >= 1.0 - NEAR and other < last[1 - side]:
-                continue
-            if there <= NEAR and other > first[1 - side] and descends(x, other, other - 1, -away):
-                continue
-            found.append((-0.5, float(k), there) if side == 0 else (-0.5, there, float(k)))
-    for k, m in itertools.product((0, 1), (0, 1)):
-        ends = (i + k, j + m)
-        if any(end in (low, high + 1) for end, low, high in zip(ends, first, last, strict=True)):
-            continue
-        gap = x[ends[1]] - x[ends[0]]
-        near = [descends(x, ends[0], n, gap) for n in (i + 1 - k, i + 3 * k - 1)]
-        near += [descends(x, ends[1], n, -gap) for n in (j + 1 - m, j + 3 * m - 1)]
-        if all(near):
-            found.append((0.25, float(k), float(m)))
+def tip_on_side(laws: Laws, x: Array, ra: float, rb: float, end: int) -> Touch:
+    """The tip x[end] of the first segment on the second one."""
+    b = x[3] - x[2]
+    length = size(b)
+    round_tip = rounding(1.0 / ra, 1.0 / ra + 1.0 / rb)
+    first = x[2] - x[end]
+    zero = 0.0 * length
+    energy, stiffness, center, covered, whole, depth = sliced(
+        first, b / length, zero, length, (zero, length), ra + rb, laws.effective * round_tip + zero
+    )
+    return Touch(
+        energy,
+        stiffness,
+        stiffness * covered / min(whole, length.real),
+        float(end),
+        center / length.real,
+        depth,
+    )
+
+
+def turned(found: Touch) -> Touch:
+    """The same seen from the other segment."""
+    found.s, found.t = found.t, found.s
     return found
+
+
+def two_tips(laws: Laws, x: Array, ra: float, rb: float, end: int, other: int) -> Touch:
+    """Spheres at the tips x[end] and x[2 + other]."""
+    depth = ra + rb - size(x[2 + other] - x[end])
+    if depth.real <= 0.0:
+        return Touch(0.0 * depth)
+    curved = 1.0 / ra + 1.0 / rb
+    stiffness = 2.0 * laws.effective * rounding(curved, curved) * np.sqrt(depth)
+    force = stiffness.real
+    energy = 4.0 / 15.0 * stiffness * depth**2
+    return Touch(energy, force, force, float(end), float(other), depth.real)
 
 
 def touch(laws: Laws, x: Array, i: int, j: int, rods: tuple[Rod, Rod]) -> Touch | None:
     """What segments i and j (first nodes in x) of the fibers do; x: nodes of both, one by one."""
     count = len(rods[0].rest)
-    first = (0, count)
-    last = (count - 2, count + len(rods[1].rest) - 2)
-    a, b, delta = x[i + 1] - x[i], x[j + 1] - x[j], x[j] - x[i]
-    ra, rb = rods[0].radius, rods[1].radius
+    nodes = x[[i, i + 1, j, j + 1]].astype(complex)
     s, t = closest_points(x[i], x[i + 1], x[j], x[j + 1])
-    c = delta + t * b - s * a
-    depth = ra + rb - float(np.linalg.norm(c))
-    if depth <= 0.0:
+    ra, rb = rods[0].radius, rods[1].radius
+    if np.linalg.norm(x[j] + t * (x[j + 1] - x[j]) - x[i] - s * (x[i + 1] - x[i])) >= ra + rb:
         return None
-    line = line_touch(laws, delta, a, b, ra, rb)
-    end_a = (s <= NEAR and i == first[0]) or (s >= 1.0 - NEAR and i == last[0])
-    end_b = (t <= NEAR and j == first[1]) or (t >= 1.0 - NEAR and j == last[1])
-    if line is not None and not (end_a or end_b):
-        return line if line.force > 0.0 else None
-    reported = not (s >= 1.0 - NEAR and i < last[0]) and not (t >= 1.0 - NEAR and j < last[1])
-    if s <= NEAR and i > first[0]:
-        reported &= bool(c @ (x[i] - x[i - 1]) >= 0.0)
-    if t <= NEAR and j > first[1]:
-        reported &= bool(c @ (x[j] - x[j - 1]) <= 0.0)
-    if line is not None and not reported:
-        return line if line.force > 0.0 else None
-    sine = np.linalg.norm(np.cross(a, b)) / np.linalg.norm(a) / np.linalg.norm(b)
-    angle = math.asin(min(1.0, max(float(sine), 0.02)))
-    tensors = [curvature(ra, None if end_a else 0.0), curvature(rb, None if end_b else angle)]
-    if line is not None and line.force >= hertz(laws, tensors, depth)[0]:
-        return line
-    points = [(1.0, s, t)] if reported else []
-    points += extrema(x, i, j, first, last) if line is None else []
-    whole = Touch(0.0, 0.0, s, t, depth)
-    for weight, on_a, on_b in points:
-        deep = ra + rb - float(np.linalg.norm(delta + on_b * b - on_a * a))
-        if deep > 0.0:
-            push, slope = hertz(laws, tensors, deep)
-            whole.force, whole.stiffness = (
-                whole.force + weight * push,
-                whole.stiffness + weight * slope,
-            )
-            whole.energy += 0.4 * weight * push * deep
-            whole.springs.append((weight * push, on_a, on_b))
-    if sine > 0.02 and not (end_a or end_b):
-        whole.twist = whole.energy * per_angle(tensors, math.copysign(angle, float(a @ b)))
-    if not reported:
-        whole.force = whole.stiffness = 0.0
-    return whole if whole.springs else None
+    end, other = int(s >= 0.5), int(t >= 0.5)
+    is_tip = i + end in (0, count - 1)
+    is_other_tip = j + other in (count, len(x) - 1)
+    kinds: list[Callable[[Array], Touch]] = [lambda y: both_sides(laws, y, ra, rb)]
+    if is_tip:
+        kinds.append(lambda y: tip_on_side(laws, y, ra, rb, end))
+    if is_other_tip:
+        kinds.append(lambda y: turned(tip_on_side(laws, y[[2, 3, 0, 1]], rb, ra, other)))
+    if is_tip and is_other_tip:
+        kinds.append(lambda y: two_tips(laws, y, ra, rb, end, other))
+    kind = max(kinds, key=lambda k: k(nodes).energy.real)
+    found = kind(nodes)
+    if found.energy.real <= 0.0:
+        return None
+    step = 1e-30
+    for place in np.ndindex(4, 3):
+        moved = nodes.copy()
+        moved[place] += 1j * step
+        found.pulls[place] = -kind(moved).energy.imag / step
+    found.energy = float(found.energy.real)
+    c = x[j] + found.t * (x[j + 1] - x[j]) - x[i] - found.s * (x[i + 1] - x[i])
+    found.force = max(0.0, float(found.pulls[2:].sum(0) @ c) / float(np.linalg.norm(c)))
+    return found
 
 
 def memory(laws: Laws, before: Memories, i: int, j: int, found: Touch, x: Array) -> Memory:
@@ -280,28 +311,13 @@ def contact_loads(
             softness += float((weights[side] ** 2 / mass[nodes[side]]).sum())
         slip = speeds[0] - speeds[1]
         damper = 2.0 * math.sqrt(5.0 / 6.0) * laws.damping
-        resistance = damper * math.sqrt(found.stiffness / softness)
-        size = found.force + resistance * float(slip @ n)
-        size = max(size, 0.0) if laws.clamp else size
-        force = -size * n
-        for push, on_i, on_j in found.springs:
-            parts = (np.array([1.0 - on_i, on_i]), np.array([1.0 - on_j, on_j]))
-            gap = parts[1] @ x[nodes[1]] - parts[0] @ x[nodes[0]]
-            spring = push / np.linalg.norm(gap) * gap
-            for side, sign in ((0, -1.0), (1, 1.0)):
-                np.add.at(forces, nodes[side], sign * np.outer(parts[side], spring))
-                if found.force > 0.0:
-                    np.add.at(forces, nodes[side], -sign * np.outer(weights[side], push * n))
-        if found.twist != 0.0:
-            edges = [x[nodes[side][1]] - x[nodes[side][0]] for side in (0, 1)]
-            axis = np.cross(*edges)
-            axis *= found.twist / np.linalg.norm(axis)
-            for side, sign in ((0, 1.0), (1, -1.0)):
-                edge = edges[side]
-                pull = sign * np.cross(axis, edge) / (edge @ edge)
-                np.add.at(forces, nodes[side], np.array([-pull, pull]))
-        if found.force <= 0.0:
-            continue
+        resistance = damper * math.sqrt(found.damped / softness)
+        pushed = found.force + resistance * float(slip @ n)
+        pushed = max(pushed, 0.0) if laws.clamp else pushed
+        pulls = found.pulls
+        np.add.at(forces, nodes[0], pulls[:2])
+        np.add.at(forces, nodes[1], pulls[2:])
+        force = (found.force - pushed) * n
         if laws.friction > 0.0:
             stiffness = laws.shear_ratio * found.stiffness
             h, old = memory(laws, earlier, i, j, found, x)
@@ -313,8 +329,11 @@ def contact_loads(
                 h = h * min(1.0, math.sqrt(old / found.depth))
             slide = slip - (slip @ n) * n
             h = h + dt * slide
-            drag = -stiffness * h - damper * math.sqrt(stiffness / softness) * slide
-            most = laws.friction * size
+            drag = (
+                -stiffness * h
+                - damper * math.sqrt(laws.shear_ratio * found.damped / softness) * slide
+            )
+            most = laws.friction * pushed
             if np.linalg.norm(drag) > most:
                 drag = drag * (most / np.linalg.norm(drag))
                 h = -drag / stiffness

@@ -82,14 +82,14 @@ def test_falling_and_pressed(damped: bool) -> None:
 
 
 def test_most_is_accounted_for() -> None:
-    """What is stored and dissipated is what was put in, to 2 %: see `contact_energy`, limits."""
+    """What is stored and dissipated is what was put in, to 0.5 %; 0.3 here, 0.1 for half of dt."""
     sim = bed()
     first = sim.measure()
     _, rows = gains(sim, 0.06, 0.022)
     for row in rows:
         lost = math.fsum(v for k, v in row.items() if k.startswith("dissipated"))
         error = stored(row) + lost - stored(first) - row["wall_work"]
-        assert abs(error) < 0.02 * (first["energy_kinetic"] + row["wall_work"])
+        assert abs(error) < 0.005 * (first["energy_kinetic"] + row["wall_work"])
 
 
 def test_stiff_contacts_set_the_step() -> None:

@@ -106,7 +106,7 @@ def test_inclination_of_a_ring() -> None:
 def test_contacts_by_node() -> None:
     """Crossing a fifth of a segment beyond a node: that node, and the middle ones of the other."""
     first = rod([0.5, 0.5, 0.5], [1, 0, 0])
-    second = rod([0.5 - 0.3 * STEP, 0.5 + 0.2 * STEP, 0.5023], [0, 1, 0])
+    second = rod([0.5 - 0.3 * STEP, 0.5 + 0.2 * STEP, 0.50239], [0, 1, 0])
     sim = measured([first, second])
     sim.prepare()
     sim_fields = fields(sim, "contact_count")

@@ -135,8 +135,8 @@ def test_steps(name: str, friction: float) -> None:
 def test_sliding_over_nodes(degrees: float) -> None:
     """A fiber dragged along another feels the same force wherever the nodes are.
 
-    Along a line every segment pushes across the axes at its own part of the patch: the sum varies
-    with the square of the tilt of its parts, a few percent of overlap / radius = 0.08.
+    Where the patch reaches far into other segments these take another slice for the deepest one:
+    second order in overlap / radius = 0.08. At wide angles no segment is that far away.
     """
     angle = math.radians(degrees)
     direction = np.array([math.cos(angle), math.sin(angle), 0.0])
@@ -148,17 +148,16 @@ def test_sliding_over_nodes(degrees: float) -> None:
         second = rod(middle - (n / 2 + 0.3 * part) * STEP * direction, direction, n)
         sim = meeting((first, second), Laws())
         force = loads(sim, (first, second))[0][: n + 1].sum(0)
-        assert np.abs(force[:2]).max() < (1e-9 if degrees > 30.0 else 3e-3) * abs(force[2])
+        assert np.abs(force[:2]).max() < (1e-9 if degrees > 40.0 else 4e-2) * abs(force[2])
         forces.append(-force[2])
-    assert np.ptp(forces) < (1e-9 if degrees > 30.0 else 3e-3) * np.mean(forces)
+    assert np.ptp(forces) < (1e-9 if degrees > 40.0 else 1e-2) * np.mean(forces)
     sine = max(math.sin(angle), 0.02)
     ratio = (1.0 + abs(math.cos(angle))) / (1.0 - abs(math.cos(angle)))
     correction = 1.0 - (ratio**0.0684 - 1.0) ** 1.531
     depth = 1e-4
     modulus = 0.5 * 7.5e5 / 0.75
     expected = 4.0 / 3.0 * modulus * math.sqrt(RADIUS / sine) * depth**1.5 * correction**-1.5
-    # as a line: overlaps to the first order in overlap / radius and in the angle squared
-    close = 1e-9 if degrees > 30.0 else 0.08
+    close = 1e-9 if degrees > 40.0 else 1e-2
     assert np.mean(forces) == pytest.approx(expected, rel=close)
 
 
@@ -170,7 +169,7 @@ def test_a_contact_that_begins_again_has_no_memory() -> None:
     sim = meeting(rods, laws, v=v)
     contacts = sim.method.contacts  # type: ignore[attr-defined]
     sim.step(5)
-    assert contacts.acts.numpy().sum() == 1
+    assert contacts.acts.numpy().sum() == 2  # the patch reaches over a node
     assert np.abs(contacts.memory.numpy()[1][:, :3]).max() > 0.0
     assert contacts.written.numpy()[1].max() == 5
     sim.step(500)

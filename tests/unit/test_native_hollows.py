@@ -1,4 +1,4 @@
-"""Pairs of bonded spheres whose law vectors leave out: none of them has a load.
+"""Kinked crowds of bonded spheres: loads of nodes by vectors and pair by pair.
 
 Bound: as of the pair sweeps in `test_native_bonds`, of the largest force; sums are in another
 order, and powers are by series.
@@ -77,10 +77,9 @@ def vector_loads(sim: Any) -> np.ndarray:
 @pytest.mark.parametrize("precision", PAIR_BOUND)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_loads(precision: str, seed: int) -> None:
-    """Forces of nodes, many of them by pairs that have no contact of their own."""
+    """Forces of nodes, many of them by pairs that share a patch."""
     sim = kinked(precision, seed)
     expected, marks = plain_loads(sim)
-    assert (marks == int(BESIDE)).sum() > 5
     assert (marks != 0).sum() > 60
     found = vector_loads(sim)
     assert np.abs(found - expected).max() < PAIR_BOUND[precision] * np.abs(expected).max()

@@ -7,7 +7,7 @@ bins of 10 degrees. `contact_count`: contacts by the node nearest to them, on bo
 `bond_stress`: largest normal stress |E e + E_b a |k|| in the bonds of a node, with the strain e and
 the change of curvature k.
 Source: Xu, Ma & Guo 2023, sections 3 and 5.
-Limits: a contact along a line counts once per pair of segments that share it.
+Limits: a patch counts once per pair of segments that share it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BIN = 10  # degrees
 
 
 def contact_forces(spheres: BondedSpheres) -> dict[str, float]:
-    """Mean sizes in N; 0 without contacts. What hollows of kinks take off again is not counted."""
+    """Mean sizes in N; 0 without contacts."""
     row = {"contact_force_mean": 0.0, "contact_force_pair_mean": 0.0}
     if spheres.contacts is None:
         return row

@@ -101,7 +101,6 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         pairs.pair_image,
         *hits,
         spheres.place,
-        state.node_pos,
         state.node_velocity,
         spheres.node_spin,
         state.step,

@@ -37,7 +37,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     _, image_shift, _, _ = make_pair_geometry(name, geometry)
-    normal_contact = make_capsule_touch(name, features.periodic, False, features.closed)
+    normal_contact = make_capsule_touch(name, features.closed)
     _, _, _, node_after, _, segment_over = make_ring_nodes(features.closed)
     neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
@@ -109,7 +109,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         hit_closest: wp.array(dtype=vec2),
         hit_count: wp.array(dtype=wp.int32),
         place: wp.array(dtype=wp.vec3d),
-        node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
@@ -153,16 +152,10 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             reach = gi.radius + gj.radius
             if wp.length_sq(c) >= reach * reach:
                 continue
-            push, depth, _energy, beside = normal_contact(
-                gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
-            )
-            has_beside = wp.ddot(beside, beside) > zero
-            if has_beside:
-                set_flag(pair_loads, k, wp.static(BESIDE))
-                set_nine(hit_beside_out, hit, beside)
-                set_number(pair_hit_out, k, hit)
-            if push[0] <= zero:
+            push, felt, springs = normal_contact(gi, gj, at_i, at_j, delta, a, b, st)
+            if felt[2] <= zero:
                 continue
+            depth = felt[0]
             s = push[2]
             t = push[3]
             c = delta + t * b - s * a
@@ -179,7 +172,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 approach = wp.dot(slip, n)
                 mass = one / (inverse_mass(gi, at_i, s) + inverse_mass(gj, at_j, t))
                 if wp.static(has_dashpot):
-                    resistance = dashpot * beta * wp.sqrt(push[1] * mass)
+                    resistance = dashpot * beta * wp.sqrt(felt[1] * mass)
                     size = wp.max(size + resistance * approach, zero)
                 if wp.static(has_friction):
                     shear = gi.shear_compliance + gj.shear_compliance
@@ -209,19 +202,19 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                             pair_step,
                         )
                     h = carried_memory(vec3(kept[0], kept[1], kept[2]), kept[3], depth, n, turn)
-                    resistance = dashpot * beta * wp.sqrt(stiffness * mass)
+                    resistance = dashpot * beta * wp.sqrt(ratio * felt[1] * mass)
                     force, h = friction_force(
                         h + dt * slide, stiffness, resistance, slide, friction * size
                     )
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now
-            force -= size * n
             set_flag(pair_acts, k, wp.uint8(1))
-            set_flag(pair_loads, k, wp.where(has_beside, wp.static(BOTH), wp.static(PUSH)))
+            set_flag(pair_loads, k, wp.static(BOTH))
             set_real(pair_push_out, k, push[0])
-            set_vector(pair_force_out, k, force)
+            set_vector(pair_force_out, k, force - (size - push[0]) * n + springs[0])
             set_number(pair_hit_out, k, hit)
             set_vector(hit_moment_out, hit, wp.cross(n, force))
+            set_nine(hit_beside_out, hit, wp.matrix_from_rows(springs[1], -springs[1], springs[2]))
             set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
 
     return capsule_pairs

@@ -5,8 +5,6 @@ segment, so they do not depend on the number of workers.
 Source: laws `capsule_contact` and `friction`. A force F does the work F . v dt with v the velocity
     after the second half kick, since nodes have v - a dt / 2 before and v + a dt / 2 after it.
     Friction dissipates what is put in against it less what its memories store.
-Limits: pushes along partial lines follow from no potential, nor does the change from lines to
-    points and to the ends of fibers: beds without friction and dashpots gain some percent by it.
 """
 
 from functools import cache
@@ -35,7 +33,7 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
     BondGroup = bond_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
-    normal_contact = make_capsule_touch(name, features.periodic, True, features.closed)
+    normal_contact = make_capsule_touch(name, features.closed)
     _, _, _, node_after, _, _ = make_ring_nodes(features.closed)
     has_friction = features.friction
     zero, half, one = real(0.0), real(0.5), real(1.0)
@@ -54,12 +52,10 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         place: wp.array(dtype=wp.vec3d),
-        node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
-        pair_push: wp.array(dtype=real),
         pair_force: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
@@ -99,32 +95,29 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
             end_j = node_after(node_j, at_j, gj.closed * (gj.segments + 1))
             b = vec3(place[end_j] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
+            st = closest_fractions(delta, a, b)
+            reach = gi.radius + gj.radius
+            if wp.length_sq(delta + st[1] * b - st[0] * a) >= reach * reach:
+                continue
+            push, felt, springs = normal_contact(gi, gj, at_i, at_j, delta, a, b, st)
+            if felt[2] <= zero:
+                continue
             if wp.static(is_step):
                 arms = pair_arms[k]
-                s = arms[0]
-                t = arms[1]
+                s = push[2]
+                t = push[3]
                 n = wp.normalize(delta + t * b - s * a)
                 slip = (one - s) * node_velocity[node_i] + s * node_velocity[end_i]
                 slip -= (one - t) * node_velocity[node_j] + t * node_velocity[end_j]
                 spin = arms[2] * ((one - s) * node_spin[node_i] + s * node_spin[end_i])
                 spin += arms[3] * ((one - t) * node_spin[node_j] + t * node_spin[end_j])
                 slip += wp.cross(spin, n)
-                force = pair_force[k]
-                size = wp.dot(force, n)
-                approach = wp.dot(slip, n)
-                normal -= wp.float64((size + pair_push[k]) * approach)
-                tangential -= wp.float64(wp.dot(force, slip) - size * approach)
+                force = pair_force[k] - springs[0]
+                along = wp.dot(force, n) * wp.dot(slip, n)
+                normal -= wp.float64(along)
+                tangential -= wp.float64(wp.dot(force, slip) - along)
             else:
-                st = closest_fractions(delta, a, b)
-                reach = gi.radius + gj.radius
-                if wp.length_sq(delta + st[1] * b - st[0] * a) >= reach * reach:
-                    continue
-                push, _depth, stored, _beside = normal_contact(
-                    gi, gj, at_i, at_j, node_i, node_j, delta, a, b, st, node_pos
-                )
-                normal += wp.float64(stored)
-                if push[0] <= zero:
-                    continue
+                normal += wp.float64(felt[2])
                 if wp.static(has_friction):
                     if pair_step[now & 1, k] == now:
                         kept = pair_memory[now & 1, k]

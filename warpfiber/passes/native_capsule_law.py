@@ -1,24 +1,15 @@
 """C++ text of the normal contact of eight pairs of segments, one lane per pair.
 
-The law of `capsule_contact` among the other segments of the two fibers (`capsule_touch`), branches
-as masks. Powers are exponentials of logarithms, both by series to rounding.
-Symbols: as in `capsule_contact`; a, b edges of the two segments, delta from start to start, `back_`
-    and `ahead_` the edges before and after them, `tip0_`, `tip1_` lanes whose segment is the first
-    or the last one of its fiber.
+The laws `capsule_contact` and `capsule_patch` as in `capsule_touch`, branches as masks. Powers are
+exponentials of logarithms, both by series to rounding.
+Symbols: as in `capsule_patch`; `tip0_`, `tip1_` lanes whose segment is the first or the last one of
+    its fiber.
 """
 
 import math
 
-from warpfiber.laws.capsule_contact import (
-    ALIGNED,
-    LINE_COSINE,
-    LINE_PART,
-    POWER,
-    SLENDER,
-    SMALLEST_SINE,
-)
-from warpfiber.passes.capsule_touch import LEAST_PART
-from warpfiber.passes.pairs import END_TOLERANCE
+from warpfiber.laws.capsule_contact import POWER, SLENDER, SMALLEST_SINE
+from warpfiber.laws.capsule_patch import BEYOND, BOTH_WAYS, PARALLEL, TURNING_SINE
 
 # Terms of log((1 + f) / (1 - f)) up to f = 3 - sqrt(8), and of exp up to half a binary digit.
 LOG_TERMS = {"float64": 11, "float32": 5}
@@ -28,18 +19,17 @@ EXP_TERMS = {"float64": 14, "float32": 8}
 def contact_constants(name: str) -> str:
     """Numbers of the law."""
     numbers = {
-        "LINE_COSINE": LINE_COSINE,
-        "LINE_PART": LINE_PART,
         "SMALLEST_SINE": SMALLEST_SINE,
-        "ALIGNED": ALIGNED,
+        "TURNING_SINE": TURNING_SINE,
+        "BOTH_WAYS": BOTH_WAYS,
+        "FURTHER": 0.5 * BEYOND,
+        "NEAR": PARALLEL[name],
+        "PARALLEL2": PARALLEL[name] ** 2,
         "SLENDER": SLENDER,
         "POWER": POWER,
         "STEEP": 1.5 * SLENDER * POWER,
-        "NEAR": END_TOLERANCE[name],
-        "LEAST_PART": LEAST_PART,
-        "ROUNDED": 2.0 * (1.0 + 1e-5),
+        "OUTERMOST": math.sqrt(0.6),
         "TINY": 1e-30,
-        "FAR": 1e30,
         "LN2": math.log(2.0),
         "ROOT2": math.sqrt(2.0),
     }
@@ -104,261 +94,254 @@ POWERS = """
     };
 """
 
-# Sets force, stiffness, s, t and depth of the lanes; no force where another pair has the contact;
-# loads of nodes on top of that force where lanes are `saddled`.
-# Without HAS_LINE for pairs none of which can be a line.
+# Slices that both segments share (`capsule_patch.side_share`), and those of a tip (`tip_share`).
+SHARES = """
+    struct Share {
+        V energy, stiffness, damped, s, t, depth;
+        V3 by_delta, by_a, by_b;
+    };
+    auto scaled = [](const V3& v, M kept) -> V3 {
+        return {kept ? v.x : V(T(0)), kept ? v.y : V(T(0)), kept ? v.z : V(T(0))};
+    };
+    auto kept_where = [&](M kept, Share& share) {
+        share.energy = kept ? share.energy : V(T(0));
+        share.stiffness = kept ? share.stiffness : V(T(0));
+        share.damped = kept ? share.damped : V(T(0));
+        share.s = kept ? share.s : V(T(0));
+        share.t = kept ? share.t : V(T(0));
+        share.depth = kept ? share.depth : V(T(0));
+        share.by_delta = scaled(share.by_delta, kept);
+        share.by_a = scaled(share.by_a, kept);
+        share.by_b = scaled(share.by_b, kept);
+    };
+    auto replace = [&](M other, Share& share, const Share& by) {
+        auto chosen = [&](const V3& v, const V3& w) -> V3 {
+            return {other ? w.x : v.x, other ? w.y : v.y, other ? w.z : v.z};
+        };
+        share.energy = other ? by.energy : share.energy;
+        share.stiffness = other ? by.stiffness : share.stiffness;
+        share.damped = other ? by.damped : share.damped;
+        share.s = other ? by.s : share.s;
+        share.t = other ? by.t : share.t;
+        share.depth = other ? by.depth : share.depth;
+        share.by_delta = chosen(share.by_delta, by.by_delta);
+        share.by_a = chosen(share.by_a, by.by_a);
+        share.by_b = chosen(share.by_b, by.by_b);
+    };
+    struct Slices { V u1, u2, part, o2, o, ou, ouu; };
+    // between low and high, of overlaps q - 2 slope x - vv x^2 at u_h + x
+    auto slices = [&](V q, V slope, V vv, V u_h, V low, V high, V length)
+        -> Slices {
+        const V wide = root(larger(slope * slope + vv * q, V(T(0))));
+        const V down = q / larger(wide - slope, V(TINY)), up = q / larger(wide + slope, V(TINY));
+        Slices sums = {larger(low, u_h - down), smaller(high, u_h + up)};
+        const V width = sums.u2 - sums.u1;
+        sums.part = width / smaller(up + down, length);
+        sums.o2 = sums.o = sums.ou = sums.ouu = V(T(0));
+        #pragma unroll
+        for (int k = -1; k <= 1; ++k) {
+            const V u = T(0.5) * (sums.u1 + sums.u2) + (T(0.5 * k) * OUTERMOST) * width;
+            const V x = u - u_h, o = q - (T(2) * slope + vv * x) * x;
+            const V g = width * (k == 0 ? T(4.0 / 9.0) : T(5.0 / 18.0)) * o;
+            sums.o2 = sums.o2 + g * o;
+            sums.o = sums.o + g;
+            sums.ou = sums.ou + g * u;
+            sums.ouu = sums.ouu + g * u * u;
+        }
+        return sums;
+    };
+    // rigidity = E* f, steepness = d ln f / d ln P
+    auto side_share = [&](const V3& delta, const V3& a, const V3& b, V la, V lb, V reach,
+                          V rigidity, V steepness, V cross, V sine, V sigma, V weight,
+                          V weight_slope) -> Share {
+        const V3 along_a = a * (T(1) / la), along_b = b * (sigma / lb);
+        const V cosine = smaller(along_a.dot(along_b), V(T(1)));
+        const V twice = root(T(2) * (T(1) + cosine)), in_twice = T(1) / twice;
+        const V3 middle = (along_a + along_b) * in_twice;
+        const V in_bm = T(1) / b.dot(middle), t0 = delta.dot(middle) * -in_bm;
+        const V ratio = sigma * la / lb, in_ratio = T(1) / ratio;
+        const V3 d0 = delta + b * t0, dv = b * ratio - a;
+        const V begin = -t0 * in_ratio, end = (T(1) - t0) * in_ratio;
+        const V first = smaller(begin, end), last = larger(begin, end);
+        const V low = larger(V(T(0)), first), high = smaller(V(T(1)), last);
+        const V vv = dv.dot(dv), flat = PARALLEL2 * la * la;
+        const V deepest = vv > flat ? -d0.dot(dv) / larger(vv, flat) : T(0.5) * (low + high);
+        const V mean = T(0.5) * (T(1) + lb / la), beyond = (T(2) * FURTHER) * mean;
+        const V ahead = smaller(V(T(0)), first) - beyond, behind = larger(V(T(1)), last) + beyond;
+        const V u_h = smaller(larger(deepest, ahead), behind);
+        const V3 nearest = d0 + dv * u_h;
+        const V h = root(nearest.dot(nearest)), in_h = T(1) / h;
+        const V q = (reach - h) * (reach + h), slope = nearest.dot(dv);
+        const Slices sums = slices(q, slope, vv, u_h, low, high, mean);
+        const M touches = (sums.u2 - sums.u1 > NEAR) & (h < reach) & (weight > T(0));
+        const V in_wide = T(1) / (reach + h), in_root = root(in_wide);
+        const V rigid = weight * rigidity * (T(2) * sine * in_twice) * la;
+        const V scale = T(0.5) * rigid * in_wide * in_wide * in_root;
+        Share share;
+        share.energy = scale * sums.o2;
+        share.stiffness = rigid * (sums.u2 - sums.u1) * in_root;
+        share.damped = share.stiffness * sums.part;
+        share.s = sums.ou / larger(sums.o, V(TINY));
+        share.t = t0 + share.s * ratio;
+        share.depth = reach - h;
+        const V pull = T(-4) * scale;
+        const V3 whole = (d0 * sums.o + dv * sums.ou) * pull;
+        const V3 moment = (d0 * sums.ou + dv * sums.ouu) * pull;
+        const V3 by_h = nearest * (T(-2.5) * share.energy * in_wide * in_h);
+        share.by_delta = whole + by_h;
+        share.by_a = (moment + by_h * u_h) * V(T(-1));
+        share.by_b = whole * t0 + moment * ratio + by_h * (t0 + u_h * ratio);
+        V by_t0 = share.by_delta.dot(b), by_ratio = -share.by_a.dot(b);
+        auto squared = [&](V u) -> V {
+            const V x = u - u_h, o = q - (T(2) * slope + vv * x) * x;
+            return scale * o * o;
+        };
+        const V none = V(T(0)), held = by_h.dot(dv);
+        // half where ends face each other and rounding would decide
+        auto beyond_zero = [&](V x) -> V {
+            return x > NEAR ? V(T(1)) : (x < -NEAR ? none : V(T(0.5)));
+        };
+        const V at_high = sums.u2 >= high ? beyond_zero(T(1) - last) * squared(sums.u2) : none;
+        const V at_low = sums.u1 <= low ? beyond_zero(first) * squared(sums.u1) : none;
+        // slices may be deepest far beyond both, where the mean length beyond them ends
+        const M is_ahead = deepest < ahead, is_behind = deepest > behind;
+        const V at_first = is_ahead ? beyond_zero(-first) * held : none;
+        const V at_last = is_behind ? beyond_zero(last - T(1)) * held : none;
+        const V stretched = is_ahead ? held : (is_behind ? -held : none);
+        by_t0 = by_t0 - (at_high - at_low + at_first + at_last) * in_ratio;
+        by_ratio = by_ratio + (FURTHER * sigma * in_ratio * stretched - at_high * sums.u2
+            + at_low * sums.u1 - at_first * first - at_last * last) * in_ratio;
+        V by_cosine = weight_slope / weight - T(0.5) / (T(1) + cosine);
+        const V steep = (T(2) * steepness + T(1)) * cosine / (sine * sine);
+        by_cosine = share.energy * (cross > TURNING_SINE ? by_cosine - steep : by_cosine);
+        by_t0 = by_t0 * -in_bm;
+        share.by_delta = share.by_delta + middle * by_t0;
+        const V3 turned = d0 * (by_t0 * in_twice);
+        share.by_a = share.by_a + along_a * (share.energy / la + by_ratio * sigma / lb)
+            + ((along_b - along_a * cosine) * by_cosine + turned
+               - along_a * turned.dot(along_a)) * (T(1) / la);
+        share.by_b = share.by_b + middle * (by_t0 * t0) - b * (by_ratio * ratio / (lb * lb))
+            + ((along_a - along_b * cosine) * by_cosine + turned
+               - along_b * turned.dot(along_b)) * (sigma / lb);
+        kept_where(touches, share);
+        return share;
+    };
+    // of a tip; the segment begins at delta from it
+    auto tip_share = [&](const V3& delta, const V3& b, V lb, V reach, V rigidity, M is_tip)
+        -> Share {
+        const V bb = lb * lb;
+        const V t_h = clamp01(-delta.dot(b) / bb);
+        const V3 nearest = delta + b * t_h;
+        const V h = root(nearest.dot(nearest));
+        const V q = (reach - h) * (reach + h);
+        const Slices sums = slices(q, nearest.dot(b), bb, t_h, V(T(0)), V(T(1)), V(T(1)));
+        const V in_wide = T(1) / (reach + h), in_root = root(in_wide);
+        const V rigid = rigidity * lb, scale = T(0.5) * rigid * in_wide * in_wide * in_root;
+        Share share;
+        share.energy = scale * sums.o2;
+        share.stiffness = rigid * (sums.u2 - sums.u1) * in_root;
+        share.damped = share.stiffness * sums.part;
+        share.s = V(T(0));
+        share.t = sums.ou / larger(sums.o, V(TINY));
+        share.depth = reach - h;
+        const V3 by_h = nearest * (T(-2.5) * share.energy * in_wide / h);
+        const V pull = T(-4) * scale;
+        share.by_delta = (delta * sums.o + b * sums.ou) * pull + by_h;
+        share.by_a = nothing3;
+        share.by_b = (delta * sums.ou + b * sums.ouu) * pull + by_h * t_h + b * (share.energy / bb);
+        kept_where(is_tip & (h < reach), share);
+        return share;
+    };
+"""
+
+# Sets `share` of the lanes, the part of its force along the normal, and what nodes feel besides.
+# Without IS_SHARED for pairs that have a patch within both segments.
 NORMAL = """
     const V reach = radius_i + radius_j;
     const V ki = T(1) / radius_i, kj = T(1) / radius_j;
     const V modulus = T(1) / (compliance_i + compliance_j);
-    const V3 c0 = delta + b * t - a * s;
-    const V square0 = c0.dot(c0);
-    const M hit = square0 < reach * reach;
-    const V aa = a.dot(a), bb = b.dot(b), ab = a.dot(b);
-    const V la = root(aa), lb = root(bb), both = T(1) / (la * lb);
-    const V cosine = (ab < T(0) ? -ab : ab) * both;
+    const V la = root(a.dot(a)), lb = root(b.dot(b)), both = T(1) / (la * lb);
+    const V signed_cosine = a.dot(b) * both;
+    const V cosine = signed_cosine < T(0) ? -signed_cosine : signed_cosine;
     const V3 normal = a.cross(b);
-    const V sine = larger(root(normal.dot(normal)) * both, V(SMALLEST_SINE));
-    V factor = V(T(1));
-    V force = V(T(0)), stiffness = V(T(0)), depth = V(T(0)), line_s = s, line_t = t;
-    M is_line = V(T(1)) < T(0);
-    if constexpr (HAS_LINE) is_line = hit & (cosine > LINE_COSINE);
-    if (HAS_LINE && any(is_line)) {
-        V steepness;
-        factor = hertz_factor(ki + kj, ki * kj * sine * sine, steepness);
-        const V3 along = b * (ab < T(0) ? V(T(-1)) : V(T(1)));
-        V3 middle = a * (T(1) / la) + along * (T(1) / lb);
-        middle = middle * (T(1) / root(middle.dot(middle)));
-        const V wa = a.dot(middle), wb = b.dot(middle), start = delta.dot(middle);
-        const V inverse_a = T(1) / wa, inverse_b = T(1) / wb;
-        const V low = larger(V(T(0)), smaller(start, start + wb)) * inverse_a;
-        const V high = smaller(wa, larger(start, start + wb)) * inverse_a;
-        const V t0 = -start * inverse_b, t1 = (wa - start) * inverse_b;
-        const V3 d0 = delta + b * t0, dv = delta + b * t1 - a - d0;
-        const V vv = dv.dot(dv), dd = d0.dot(dv), square = d0.dot(d0);
-        const V held = larger(vv, V(TINY));
-        const V closest = root(larger(square - dd * dd / held, V(T(0))));
-        const V deepest = reach - closest;
-        // overlap q - p u - e u^2, and its roots without the difference of large numbers
-        const V scale = T(1) / (reach + closest);
-        const V q = scale * (reach * reach - square), p = scale * T(2) * dd, e = scale * vv;
-        V wide = root(larger(p * p + T(4) * e * q, V(T(0))));
-        wide = p < T(0) ? -wide : wide;
-        const V u = T(-0.5) * (p + wide);
-        const V size = u < T(0) ? -u : u;
-        const V first = size > TINY ? -q / u : V(-FAR);
-        V second = u < T(0) ? V(-FAR) : V(FAR);
-        second = size < T(1e20) * e ? u / e : second;
-        const V u0 = larger(low, smaller(first, second)), u1 = smaller(high, larger(first, second));
-        const V w1 = u1 - u0, s0 = u0 * u0, s1 = u1 * u1;
-        const V w2 = T(0.5) * (s1 - s0), w3 = (s1 * u1 - s0 * u0) * T(1.0 / 3.0);
-        const V w4 = T(0.25) * (s1 * s1 - s0 * s0);
-        V integral = larger(q * w1 - p * w2 - e * w3, V(T(0)));
-        integral = ((deepest > T(0)) & (u1 > u0)) ? integral : V(T(0));
-        V center = (q * w2 - p * w3 - e * w4) / larger(integral, V(TINY));
-        center = center > u0 ? center : u0;
-        center = center < u1 ? center : u1;
-        const V patch = LINE_PART * smaller(la, lb) * sine;
-        is_line &= T(2) * reach * deepest >= patch * patch;
-        const M acts = is_line & (integral > T(0));
-        const V length = la * root(T(0.5) * (T(1) + cosine));
-        const V k = modulus * factor * sine * length / root(T(2) * reach);
-        const V per_part = T(1) / (t1 - t0), beyond = T(0.5) * (T(1) + lb / la);
-        const V ahead = -t0 * per_part, behind = (T(1) - t0) * per_part;
-        const V lowest = smaller(V(T(0)), smaller(ahead, behind)) - beyond;
-        const V highest = larger(V(T(1)), larger(ahead, behind)) + beyond;
-        const V way = smaller(larger(-dd / held, lowest), highest);
-        const V3 there = d0 + dv * way;
-        force = acts ? k * integral : force;
-        stiffness = acts ? k * w1 : stiffness;
-        line_s = acts ? center : line_s;
-        line_t = acts ? clamp01(t0 + center * (t1 - t0)) : line_t;
-        depth = acts ? reach - root(there.dot(there)) : depth;
-    }
-
-    const M low_i = s <= NEAR, high_i = s >= T(1) - NEAR;
-    const M low_j = t <= NEAR, high_j = t >= T(1) - NEAR;
-    const M end_i = (low_i & tip0_i) | (high_i & tip1_i);
-    const M end_j = (low_j & tip0_j) | (high_j & tip1_j);
-    M reject = (high_i & ~tip1_i) | (high_j & ~tip1_j) | (is_line & ~(end_i | end_j)) | ~hit;
-    reject |= low_i & ~tip0_i & (c0.dot(back_i) < -NEAR * back_i.dot(back_i));
-    reject |= low_j & ~tip0_j & (c0.dot(back_j) > NEAR * back_j.dot(back_j));
-    // saddles and maxima of the distance between lanes' segments, beside a minimum or without one
-    const V deep = larger(reach - root(square0), V(T(0))), deep_root = root(deep);
-    const V all = deep * deep_root, patch = root(T(2) * reach * deep) / sine;
-    V less = V(T(0)), less_root = V(T(0)), stored = V(T(0));
-    V3 beside_i0 = nothing3, beside_i1 = nothing3, beside_j0 = nothing3, beside_j1 = nothing3;
-    const V far_i = s * la, far_j = t * lb;
-    const M bends = hit & ~is_line;
-    const M at0_i = bends & ~tip0_i & (far_i < patch);
-    const M at1_i = bends & ~tip1_i & (la - far_i < patch);
-    const M at0_j = bends & ~tip0_j & (far_j < patch);
-    const M at1_j = bends & ~tip1_j & (lb - far_j < patch);
-    // one lane at a time: they are few
-    struct One {
-        T x, y, z;
-        One operator+(const One& b) const { return {x + b.x, y + b.y, z + b.z}; }
-        One operator-(const One& b) const { return {x - b.x, y - b.y, z - b.z}; }
-        One operator-() const { return {-x, -y, -z}; }
-        One operator*(T s) const { return {x * s, y * s, z * s}; }
-        T dot(const One& b) const { return x * b.x + y * b.y + z * b.z; }
-        bool nears(const One& edge) const { return dot(edge) > NEAR * edge.dot(edge); }
+    const V cross = root(normal.dot(normal)) * both, sine = larger(cross, V(SMALLEST_SINE));
+    V steepness;
+    const V rigidity = modulus * hertz_factor(ki + kj, ki * kj * sine * sine, steepness);
+    auto point_share = [&](V deep, V stiff) -> Share {
+        const V3 gap = delta + b * t - a * s;
+        Share at = {T(4.0 / 15.0) * stiff * deep * deep, stiff, stiff, s, t, deep};
+        at.by_delta = gap * (T(-2.0 / 3.0) * stiff * deep / root(gap.dot(gap)));
+        at.by_a = at.by_delta * -s;
+        at.by_b = at.by_delta * t;
+        return at;
     };
-    auto one_of = [](const V& v, int l) -> T { return ((const T*)&v)[l]; };
-    auto at_lane = [](const V3& v, int l) -> One {
-        return {((const T*)&v.x)[l], ((const T*)&v.y)[l], ((const T*)&v.z)[l]};
-    };
-    auto add_lane = [](V& v, int l, T more) { ((T*)&v)[l] += more; };
-    auto add3 = [](V3& v, int l, const One& more) {
-        ((T*)&v.x)[l] += more.x;
-        ((T*)&v.y)[l] += more.y;
-        ((T*)&v.z)[l] += more.z;
-    };
-    auto count_depth = [&](int l, T sign, T below, T root_there) {
-        const T pull = below * root_there;
-        add_lane(less_root, l, sign * root_there);
-        add_lane(less, l, sign * pull);
-        add_lane(stored, l, -sign * below * pull);
-        return pull;
-    };
-    auto saddle = [&](int l, const One& vertex, const One& inward, const One& onward,
-                      const One& from, const One& other, const One& behind, bool tip0, bool tip1,
-                      V3& on_vertex, V3& on_start, V3& on_end) {
-        T part = (vertex - from).dot(other) / other.dot(other);
-        part = part > T(0) ? part : T(0);
-        part = part < T(1) ? part : T(1);
-        const One away = from + other * part - vertex;
-        const T square = away.dot(away), span = one_of(reach, l);
-        if (square >= span * span || !away.nears(inward) || !away.nears(onward)) return;
-        if (part >= T(1) - NEAR && !tip1) return;
-        if (part <= NEAR && !tip0 && (-away).nears(behind)) return;
-        const T far = __builtin_elementwise_sqrt(square), below = span > far ? span - far : T(0);
-        const T pull = count_depth(l, T(1), below, T(0.5) * __builtin_elementwise_sqrt(below));
-        const One on = away * (pull / far);
-        add3(on_vertex, l, on);
-        add3(on_start, l, on * (part - T(1)));
-        add3(on_end, l, on * -part);
-    };
-    auto summit = [&](int l, const One& gap, const One& inward_i, const One& onward_i,
-                      const One& inward_j, const One& onward_j, V3& on_i, V3& on_j) {
-        const T square = gap.dot(gap), span = one_of(reach, l);
-        const One back = -gap;
-        if (square >= span * span || !gap.nears(inward_i) || !gap.nears(onward_i)) return;
-        if (!back.nears(inward_j) || !back.nears(onward_j)) return;
-        const T far = __builtin_elementwise_sqrt(square), below = span > far ? span - far : T(0);
-        const T push = count_depth(l, T(-1), below, T(0.25) * __builtin_elementwise_sqrt(below));
-        const One on = gap * (push / far);
-        add3(on_i, l, -on);
-        add3(on_j, l, on);
-    };
-    if (any(at0_i | at1_i | at0_j | at1_j)) {
-        const V3 onto_i = nothing3 - back_i, onto_j = nothing3 - back_j;
-        // where the distance falls beyond a node: most nodes are out here, without their distances
-        const V da = delta.dot(a), db = delta.dot(b), both2 = both * both;
-        const V in_aa = bb * both2, in_bb = aa * both2;
-        const V b_onto = b.dot(onto_i), b_ahead = b.dot(ahead_i);
-        const V a_onto = a.dot(onto_j), a_ahead = a.dot(ahead_j);
-        const V i00 = delta.dot(onto_i), i01 = i00 + b_onto;
-        const V i10 = (delta - a).dot(ahead_i), i11 = i10 + b_ahead;
-        const V j00 = delta.dot(onto_j), j10 = j00 - a_onto;
-        const V j01 = (delta + b).dot(ahead_j), j11 = j01 - a_ahead;
-        const M down0_i = i00 + clamp01(-db * in_bb) * b_onto > T(0);
-        const M down1_i = i10 + clamp01((ab - db) * in_bb) * b_ahead > T(0);
-        const M down0_j = j00 - clamp01(da * in_aa) * a_onto < T(0);
-        const M down1_j = j01 - clamp01((da + ab) * in_aa) * a_ahead < T(0);
-        const M down00 = (da > T(0)) & (db < T(0)) & (i00 > T(0)) & (j00 < T(0));
-        const M down01 = (da > -ab) & (db > -bb) & (i01 > T(0)) & (j01 < T(0));
-        const M down10 = (da < aa) & (db < ab) & (i10 > T(0)) & (j10 < T(0));
-        const M down11 = (da < aa - ab) & (db > ab - bb) & (i11 > T(0)) & (j11 < T(0));
-        const unsigned saddle0_i = bits(at0_i & ~low_i & down0_i);
-        const unsigned saddle1_i = bits(at1_i & ~high_i & down1_i);
-        const unsigned saddle0_j = bits(at0_j & ~low_j & down0_j);
-        const unsigned saddle1_j = bits(at1_j & ~high_j & down1_j);
-        const unsigned summit00 = bits(at0_i & at0_j & down00);
-        const unsigned summit01 = bits(at0_i & at1_j & down01);
-        const unsigned summit10 = bits(at1_i & at0_j & down10);
-        const unsigned summit11 = bits(at1_i & at1_j & down11);
-        const unsigned summits = summit00 | summit01 | summit10 | summit11;
-        unsigned left = (saddle0_i | saddle1_i | saddle0_j | saddle1_j | summits)
-            & ((1u << count) - 1u);
-        for (; left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left);
-            const One start = {T(0), T(0), T(0)}, from = at_lane(delta, l);
-            const One u = at_lane(a, l), w = at_lane(b, l), end = from + w;
-            const One before_i = at_lane(onto_i, l), after_i = at_lane(ahead_i, l);
-            const One before_j = at_lane(onto_j, l), after_j = at_lane(ahead_j, l);
-            const int tips_i = ((const int*)&code_i)[l], tips_j = ((const int*)&code_j)[l];
-            const bool first_i = tips_i & 1, last_i = tips_i & 2;
-            const bool first_j = tips_j & 1, last_j = tips_j & 2;
-            if (saddle0_i >> l & 1)
-                saddle(l, start, u, before_i, from, w, before_j, first_j, last_j,
-                       beside_i0, beside_j0, beside_j1);
-            if (saddle1_i >> l & 1)
-                saddle(l, u, -u, after_i, from, w, before_j, first_j, last_j,
-                       beside_i1, beside_j0, beside_j1);
-            if (saddle0_j >> l & 1)
-                saddle(l, from, w, before_j, start, u, before_i, first_i, last_i,
-                       beside_j0, beside_i0, beside_i1);
-            if (saddle1_j >> l & 1)
-                saddle(l, end, -w, after_j, start, u, before_i, first_i, last_i,
-                       beside_j1, beside_i0, beside_i1);
-            if (!(summits >> l & 1)) continue;
-            if (summit00 >> l & 1)
-                summit(l, from, u, before_i, w, before_j, beside_i0, beside_j0);
-            if (summit01 >> l & 1)
-                summit(l, end, u, before_i, -w, after_j, beside_i0, beside_j1);
-            if (summit10 >> l & 1)
-                summit(l, from - u, -u, after_i, w, before_j, beside_i1, beside_j0);
-            if (summit11 >> l & 1)
-                summit(l, end - u, -u, after_i, -w, after_j, beside_i1, beside_j1);
+    const V3 closest_gap = delta + b * t - a * s;
+    Share share;
+    if constexpr (!IS_SHARED) {
+        const V deep = larger(reach - root(closest_gap.dot(closest_gap)), V(T(0)));
+        share = point_share(deep, T(2) * rigidity * root(deep));
+        // a wider angle stores less: d ln P = -2 cos d cos / sin^2
+        V twist = T(-2) * steepness * share.energy * signed_cosine / (sine * sine);
+        twist = cross > TURNING_SINE ? twist : V(T(0));
+        const V3 along_a = a * (T(1) / la), along_b = b * (T(1) / lb);
+        share.by_a = share.by_a + (along_b - along_a * signed_cosine) * (twist / la);
+        share.by_b = share.by_b + (along_a - along_b * signed_cosine) * (twist / lb);
+    } else {
+        const V sigma = signed_cosine < T(0) ? V(T(-1)) : V(T(1));
+        const M two_ways = cosine < BOTH_WAYS;
+        const V weight = two_ways ? T(0.5) + cosine : V(T(1));
+        const V weight_slope = two_ways ? V(T(1)) : V(T(0));
+        share = side_share(delta, a, b, la, lb, reach, rigidity, steepness, cross, sine, sigma,
+                           weight, weight_slope);
+        if (any(two_ways)) {
+            const Share more = side_share(delta, a, b, la, lb, reach, rigidity, steepness, cross,
+                                          sine, -sigma, T(1) - weight, weight_slope);
+            const V energy = share.energy + more.energy;
+            const V part = energy > T(0) ? more.energy / energy : V(T(0));
+            share.s = share.s + (more.s - share.s) * part;
+            share.t = share.t + (more.t - share.t) * part;
+            share.energy = energy;
+            share.stiffness = share.stiffness + more.stiffness;
+            share.damped = share.damped + more.damped;
+            share.depth = larger(share.depth, more.depth);
+            share.by_delta = share.by_delta + more.by_delta;
+            share.by_a = share.by_a + more.by_a;
+            share.by_b = share.by_b + more.by_b;
+        }
+        const M is_tip_i = s < T(0.5) ? tip0_i : tip1_i, is_tip_j = t < T(0.5) ? tip0_j : tip1_j;
+        if (any(is_tip_i | is_tip_j)) {
+            s = s < T(0.5) ? V(T(0)) : V(T(1));
+            t = t < T(0.5) ? V(T(0)) : V(T(1));
+            const V total = ki + kj;
+            V none;
+            const V round_i = modulus * hertz_factor(ki + total, ki * total, none);
+            Share tip = tip_share(delta - a * s, b, lb, reach, round_i, is_tip_i);
+            tip.s = s;
+            tip.by_a = tip.by_delta * -s;
+            replace(tip.energy > share.energy, share, tip);
+            const V round_j = modulus * hertz_factor(kj + total, kj * total, none);
+            tip = tip_share(nothing3 - delta - b * t, a, la, reach, round_j, is_tip_j);
+            tip.s = tip.t;
+            tip.t = t;
+            tip.by_a = tip.by_b;
+            tip.by_b = tip.by_delta * -t;
+            tip.by_delta = tip.by_delta * V(T(-1));
+            replace(tip.energy > share.energy, share, tip);
+            const V3 gap = delta + b * t - a * s;
+            const V deep = larger(reach - root(gap.dot(gap)), V(T(0)));
+            const V round = modulus * hertz_factor(T(2) * total, total * total, none);
+            tip = point_share(deep, T(2) * round * root(deep));
+            replace(is_tip_i & is_tip_j & (tip.energy > share.energy), share, tip);
         }
     }
-    M saddled = less != T(0);  // less than nothing where a maximum is deeper than the saddles
-    if (any(~reject | saddled)) {
-        const V total = ki + kj;
-        V sum = end_i ? ki + total : total, product = end_i ? ki * total : ki * kj * sine * sine;
-        sum = end_j ? kj + total : sum;
-        product = end_j ? kj * total : product;
-        sum = (end_i & end_j) ? T(2) * total : sum;
-        product = (end_i & end_j) ? total * total : product;
-        V steepness;
-        factor = hertz_factor(sum, product, steepness);
-        const V k = T(2) * modulus * factor, scale = T(2.0 / 3.0) * k;
-        const M point = ~reject & ~(force >= scale * all);
-        saddled = (saddled & (point | reject)) | point;
-        const V net = larger(all - less, LEAST_PART * all);
-        // of the whole minimum, this is not in the force at s and t
-        const V3 rest = c0 * (point ? (all - net) / root(square0) : V(T(0)));
-        beside_i0 = (beside_i0 - rest * (T(1) - s)) * scale;
-        beside_i1 = (beside_i1 - rest * s) * scale;
-        beside_j0 = (beside_j0 + rest * (T(1) - t)) * scale;
-        beside_j1 = (beside_j1 + rest * t) * scale;
-        // a wider angle stores less: d ln P = -2 cos d cos / sin^2
-        stored += point ? deep * all : V(T(0));
-        const V cosine1 = ab * both;
-        V twist = T(0.8) * scale * stored * steepness * cosine1 / (sine * sine);
-        twist = (end_i | end_j | (sine <= SMALLEST_SINE)) ? V(T(0)) : twist;
-        const V3 along_a = a * (T(1) / la), along_b = b * (T(1) / lb);
-        const V3 on_i = (along_b - along_a * cosine1) * (twist / la);
-        const V3 on_j = (along_a - along_b * cosine1) * (twist / lb);
-        beside_i0 = beside_i0 - on_i;
-        beside_i1 = beside_i1 + on_i;
-        beside_j0 = beside_j0 - on_j;
-        beside_j1 = beside_j1 + on_j;
-        force = point ? scale * net : force;
-        stiffness = point ? k * larger(deep_root - less_root, LEAST_PART * deep_root) : stiffness;
-        depth = point ? deep : depth;
-        line_s = point ? s : line_s;
-        line_t = point ? t : line_t;
-    }
-    auto of_saddled = [&](V3& load) {
-        load = V3{saddled ? load.x : V(T(0)), saddled ? load.y : V(T(0)),
-                  saddled ? load.z : V(T(0))};
-    };
-    of_saddled(beside_i0);
-    of_saddled(beside_i1);
-    of_saddled(beside_j0);
-    of_saddled(beside_j1);
-    s = line_s;
-    t = line_t;
+    s = share.s;
+    t = share.t;
+    const V3 c = delta + b * t - a * s;
+    const V distance = root(c.dot(c));
+    const V3 n = c * (T(1) / distance);
+    const V force = larger(-share.by_delta.dot(n), V(T(0)));
+    const V stiffness = share.stiffness, damped = share.damped, depth = share.depth;
+    // of the first nodes; the second ones feel the reverse
+    const V3 couple_i = share.by_a + share.by_delta * s;
+    const V3 couple_j = share.by_b - share.by_delta * t;
 """

@@ -82,9 +82,9 @@ _ROWS = """
 
 
 # Distance vector and closest points of pairs of segments that begin at nodes, products of their
-# edges; whether they are nearly parallel, with a margin for rounding.
+# edges.
 DISTANCE = """
-    auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t, M& aligned,
+    auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t,
                        V& aa, V& bb, V& ab) -> V3 {
         P4 rows_a[W], rows_b[W], rows_d[W];
         for (int l = 0; l < W; ++l) {
@@ -100,7 +100,6 @@ DISTANCE = """
         bb = larger(b.dot(b), V(TINY));
         ab = a.dot(b);
         const V da = delta.dot(a), db = delta.dot(b);
-        aligned = ab * ab > T(ALIGNED) * aa * bb;
         const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
         s = clamp01((da * bb - db * ab) / den);
         t = clamp01((s * ab - db) / bb);

@@ -1,10 +1,9 @@
 """C++ text of the SIMD sweep over listed pairs of bonded spheres (`native_capsules`).
 
-Distances of LANES near pairs at a time; pairs that may have a load are collected, those that are
-aligned apart (`native_capsule_hits`), and have the law of contact LANES at a time, normal
-(`native_capsule_law`) and tangential as in `capsule_pairs` and `friction`. What waits for its law
-is fetched into the cache meanwhile. A memory that must be handed over is looked for pair by pair:
-that is rare.
+Distances of LANES near pairs at a time; pairs within reach are collected, those whose patch reaches
+beyond a segment apart, and have the law of contact LANES at a time, normal (`native_capsule_law`)
+and tangential as in `capsule_pairs` and `friction`. What waits for its law is fetched into the
+cache meanwhile. A memory that must be handed over is looked for pair by pair: that is rare.
 Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list, `at` among near pairs.
 """
 
@@ -12,8 +11,8 @@ from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native import lane_types
-from warpfiber.passes.native_capsule_hits import MATTERS, SWEEP
-from warpfiber.passes.native_capsule_law import NORMAL, POWERS, contact_constants
+from warpfiber.passes.native_capsule_hits import SWEEP
+from warpfiber.passes.native_capsule_law import NORMAL, POWERS, SHARES, contact_constants
 from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_source
 
 # Pairs in both precisions: two registers of eight numbers hide each other's latency.
@@ -78,8 +77,8 @@ _HAND_OVER = """
 _LAW = """
     auto law = [&](auto kind, const int* ats, const T* ss, const T* ts, int count)
         __attribute__((noinline)) {
-        constexpr bool HAS_LINE = decltype(kind)::HAS_LINE;
-        P4 rows_a[W], rows_b[W], rows_d[W], rows_bi[W], rows_ai[W], rows_bj[W], rows_aj[W];
+        constexpr bool IS_SHARED = decltype(kind)::IS_SHARED;
+        P4 rows_a[W], rows_b[W], rows_d[W];
         int ks[W], node_i[W], node_j[W];
         I code_i, code_j, images;
         for (int l = 0; l < W; ++l) {
@@ -89,17 +88,11 @@ _LAW = """
             ((int*)&code_j)[l] = of_j;
             ((int*)&images)[l] = near_image[at];
             const long at_i = node_i[l] = of_i >> TIP_BITS, at_j = node_j[l] = of_j >> TIP_BITS;
-            const int first_i = of_i & 1, last_i = of_i >> 1 & 1;
-            const int first_j = of_j & 1, last_j = of_j >> 1 & 1;
             const P4 xi = place_row(at_i), xi1 = place_row(at_i + 1);
             const P4 xj = place_row(at_j), xj1 = place_row(at_j + 1);
             rows_a[l] = xi1 - xi;
             rows_b[l] = xj1 - xj;
             rows_d[l] = xj - xi;
-            rows_bi[l] = xi - place_row(at_i - 1 + first_i);
-            rows_ai[l] = place_row(at_i + 2 - last_i) - xi1;
-            rows_bj[l] = xj - place_row(at_j - 1 + first_j);
-            rows_aj[l] = place_row(at_j + 2 - last_j) - xj1;
         }
         auto of = [](const T* from) -> V {
             V v;
@@ -118,22 +111,15 @@ _LAW = """
         const V3 a = turn(rows_a), b = turn(rows_b);
         V3 delta = turn(rows_d);
         add_images(images, delta);
-        const V3 back_i = turn(rows_bi), ahead_i = turn(rows_ai);
-        const V3 back_j = turn(rows_bj), ahead_j = turn(rows_aj);
         const M tip0_i = tipped(code_i, 1), tip1_i = tipped(code_i, 2);
         const M tip0_j = tipped(code_j, 1), tip1_j = tipped(code_j, 2);
         const V radius_i = OF(pair_i, radius), radius_j = OF(pair_j, radius);
         const V compliance_i = OF(pair_i, compliance), compliance_j = OF(pair_j, compliance);
         V s = of(ss), t = of(ts);
         NORMAL
-        const M acts = force > T(0);
-        const unsigned mine = bits(acts) & ((1u << count) - 1u);
-        const unsigned loaded = bits(acts | saddled) & ((1u << count) - 1u);
-        if (loaded == 0) return;
+        const unsigned mine = bits(share.energy > T(0)) & ((1u << count) - 1u);
+        if (mine == 0) return;
 
-        const V3 c = delta + b * t - a * s;
-        const V distance = root(c.dot(c));
-        const V3 n = c * (T(1) / distance);
         const V arm_i = T(0.5) * (distance + radius_i - radius_j), arm_j = distance - arm_i;
         V size = force;
         V3 drag = same3(0, 0, 0);
@@ -163,12 +149,13 @@ _LAW = """
                 + s * s / (tip1_i ? tip_i : in_i) + rest_t * rest_t / (tip0_j ? tip_j : in_j)
                 + t * t / (tip1_j ? tip_j : in_j));
             if constexpr (HAS_DASHPOT) {
-                const V resistance = DASHPOT * beta * root(stiffness * mass);
+                const V resistance = DASHPOT * beta * root(damped * mass);
                 size = larger(size + resistance * approach, V(T(0)));
             }
             if constexpr (HAS_FRICTION) {
                 const V shear = OF(pair_i, shear_compliance) + OF(pair_j, shear_compliance);
-                const V k = T(4) * (compliance_i + compliance_j) / shear * stiffness;
+                const V shear_part = T(4) * (compliance_i + compliance_j) / shear;
+                const V k = shear_part * stiffness;
                 const V3 slide = slip - n * approach;
                 const V twist = T(0.5) * dt * turn(spun).dot(n);
                 const V far_i = la * smaller(s, rest_s), far_j = lb * smaller(t, rest_t);
@@ -201,7 +188,7 @@ _LAW = """
                 scale = depth > before ? scale * root(before / depth) : scale;
                 scale = before > T(0) ? scale : V(T(0));
                 V3 path = flat * scale + slide * dt;
-                const V resistance = DASHPOT * beta * root(k * mass);
+                const V resistance = DASHPOT * beta * root(shear_part * damped * mass);
                 drag = nothing3 - path * k - slide * resistance;
                 const V whole = root(drag.dot(drag)), limit = friction * size;
                 const M slides = whole > limit;
@@ -214,8 +201,8 @@ _LAW = """
                 turn_back(numbers, memories);
             }
         }
-        const V3 whole = drag - n * size;
-        const V3 moment = n.cross(whole);
+        const V3 whole = drag - n * (size - force) + share.by_delta;
+        const V3 moment = n.cross(drag);
         T8 rows[4][W];
         auto load_row = [&](int m, const V3& force_there, V part) {
             const V lever = part * (m < 2 ? arm_i : arm_j);
@@ -224,11 +211,11 @@ _LAW = """
             numbers[6] = numbers[7] = V(T(0));
             turn_back(numbers, rows[m]);
         };
-        load_row(0, beside_i0 + whole * (T(1) - s), T(1) - s);
-        load_row(1, beside_i1 + whole * s, s);
-        load_row(2, beside_j0 - whole * (T(1) - t), T(1) - t);
-        load_row(3, beside_j1 - whole * t, t);
-        for (unsigned left = loaded; left != 0; left &= left - 1) {
+        load_row(0, whole * (T(1) - s) + couple_i, T(1) - s);
+        load_row(1, whole * s - couple_i, s);
+        load_row(2, couple_j - whole * (T(1) - t), T(1) - t);
+        load_row(3, nothing3 - couple_j - whole * t, t);
+        for (unsigned left = mine; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             auto add = [&](int node, T8 values) {
                 // the line of a node without loads yet is not the first one, which is of zeros
@@ -240,7 +227,6 @@ _LAW = """
             add(node_i[l] + 1, rows[1][l]);
             add(node_j[l], rows[2][l]);
             add(node_j[l] + 1, rows[3][l]);
-            if (!(mine >> l & 1)) continue;
             const long k = ks[l];
             if constexpr (HAS_FRICTION) {
                 __builtin_memcpy(kept_now + 4 * k, &memories[l], sizeof(T4));
@@ -289,10 +275,10 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     T8* const load = load_lines + part_line;
     wp::uint8* const touch = contact_touch + (long)node_count * part;
     {POWERS}
+    {SHARES}
     {_HAND_OVER}
     {DISTANCE}
     {law}
-    {MATTERS}
     {SWEEP}
     }};
     sweep();

@@ -26,8 +26,7 @@ _NEAR = """
             ((T*)&reach)[l] = largest_reach + skin_of(from_i[l]) + skin_of(from_j[l]);
         }
         V s, t, aa, bb, ab;
-        M aligned;
-        const V3 c = closest(images, from_i, from_j, s, t, aligned, aa, bb, ab);
+        const V3 c = closest(images, from_i, from_j, s, t, aa, bb, ab);
         const M near = c.dot(c) <= reach * reach;
         for (int l = 0; l < count; ++l) {
             near_pair[found] = ks[l];
@@ -49,7 +48,7 @@ def near_list_source(name: str, features: CapsuleFeatures, arrays: list[str]) ->
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
     {capsule_constants(name, features)}
-    constexpr T TINY = T(1e-30), ALIGNED = T(1);
+    constexpr T TINY = T(1e-30);
     {row_source()}
     auto larger = [](V x, V y) -> V {{ return x > y ? x : y; }};
     auto clamp01 = [](V x) -> V {{
