@@ -39,6 +39,7 @@ FRAMES: dict[str, tuple[int, str]] = {
     "bond_drift": (40, "as bond_sweep"),
     "find_pairs": (768, "lists of waiting midpoints, places in them are known at run time alone"),
     "chain_step": (640, "in float64 two blocks and three nodes need more than 255 registers"),
+    "capsule_pairs": (160, "in float64 a share with its gradient needs more than 255 registers"),
 }
 
 FORMAT_SIZED = 0x04

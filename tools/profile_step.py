@@ -7,8 +7,8 @@ what a full sweep must move at least. They are compared with a copy of as many b
 (CPU only), so that a pass far below that bandwidth is bound by arithmetic or latency, not by
 memory. One above it ended before it needed its arrays (no pair was near, nothing was left to
 repeat). Passes of one name count together; of a sort or a scan of Warp the bytes are not known.
-Overhead: whole steps less their passes, timed apart; its noise is that of both, and steps of
-implicit methods that were taken again are in it.
+Overhead: whole steps less their passes, timed apart. Times of passes are medians over steps, so
+what only some steps do (second solves, long relaxations, steps taken again) is in it.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def test_energy_at_nodes(name: str, way: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_is_stored_is_that_of_the_restatement() -> None:
-    """In the middle of an impact, where saddles count; k eps of the energy."""
+    """In the middle of an impact over nodes, where segments share a patch; k eps of the energy."""
     sim = thrown("at the nodes", 0.1)
     sim.run(time=4e-4)
     rods, _ = crossed("at the nodes", SEGMENTS)

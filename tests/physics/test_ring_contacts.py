@@ -158,9 +158,8 @@ def pushes(sim: Simulation) -> np.ndarray:
     contacts = sim.method.contacts  # type: ignore[attr-defined]
     count = sim.method.list.pair_count  # type: ignore[union-attr]
     acts = contacts.acts.numpy()[:count] != 0
-    bends = contacts.loads.numpy()[:count] >= 2
     total: np.ndarray = contacts.force.numpy()[:count][acts].sum(axis=0)
-    total += contacts.beside.numpy()[contacts.pair_hit.numpy()[:count][bends]][:, :2].sum(
+    total += contacts.beside.numpy()[contacts.pair_hit.numpy()[:count][acts]][:, :2].sum(
         axis=(0, 1)
     )
     return total

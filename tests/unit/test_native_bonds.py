@@ -300,7 +300,7 @@ def test_flags() -> None:
 
 def test_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
     """What only the plain sweeps use is not there where vectors run."""
-    names = "moment loads beside hit_pair hit_closest hit_count acting node_force".split()
+    names = "moment pair_hit beside hit_pair hit_closest hit_count acting node_force".split()
     contacts = crowd().method.contacts  # type: ignore[attr-defined]
     assert not any(hasattr(contacts, name) for name in names)
     monkeypatch.setattr(bonded_spheres, "NATIVE", False)

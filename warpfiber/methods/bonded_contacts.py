@@ -61,7 +61,6 @@ class BondedContacts:
         p, device = self.model.precision, self.model.device
         size = self.search.list.pair_capacity
         self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
-        self.push = wp.zeros(size, dtype=p.real, device=device)  # without dashpot
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
         kept = size if self.features.friction else 0
@@ -80,8 +79,7 @@ class BondedContacts:
         """What the plain sweeps hand from one to the next."""
         p, device = self.model.precision, self.model.device
         size, nodes = self.search.list.pair_capacity, self.model.node_count
-        self.loads = wp.zeros(size, dtype=wp.uint8, device=device)  # PUSH, BESIDE, BOTH or 0
-        self.pair_hit = wp.zeros(size, dtype=wp.int32, device=device)  # of those with loads
+        self.pair_hit = wp.zeros(size, dtype=wp.int32, device=device)  # of those that act
         # by hit, which lie beside each other
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
         self.beside = wp.zeros(size, dtype=p.mat33, device=device)

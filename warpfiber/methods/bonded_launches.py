@@ -80,7 +80,6 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         spheres.place,
         state.status,
         contacts.acts,
-        contacts.loads,
         *hits,
     ]
     near = Launch("hits", make_capsule_hits(p.name, contacts.features), parts, inputs, split=True)
@@ -105,10 +104,8 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         spheres.node_spin,
         state.step,
         contacts.acts,
-        contacts.push,
         contacts.force,
         contacts.arms,
-        contacts.loads,
         contacts.pair_hit,
         contacts.moment,
         contacts.beside,
@@ -132,7 +129,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts
         gathered = [pairs.out_start, pairs.in_start, pairs.in_pair, pairs.pair_i, pairs.pair_j]
-        gathered += [contacts.force, contacts.arms, contacts.loads]
+        gathered += [contacts.force, contacts.arms, contacts.acts]
         gathered += [contacts.pair_hit, contacts.moment, contacts.beside]
         gathered += [contacts.acting, contacts.node_force, contacts.node_moment]
     inputs = [

@@ -136,7 +136,6 @@ class NativeBonds:
             spheres.node_spin,
             state.step,
             contacts.acts,
-            contacts.push,
             contacts.force,
             contacts.arms,
             contacts.memory,

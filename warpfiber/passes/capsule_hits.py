@@ -57,7 +57,6 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
         place: wp.array(dtype=wp.vec3d),
         status: wp.array(dtype=wp.int32),
         pair_acts_out: wp.array(dtype=wp.uint8),
-        pair_loads_out: wp.array(dtype=wp.uint8),
         hit_pair_out: wp.array(dtype=wp.int32),
         hit_closest_out: wp.array(dtype=vec2),
         hit_count_out: wp.array(dtype=wp.int32),
@@ -86,7 +85,6 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
             st = closest_fractions(delta, a, b)
             c = delta + st[1] * b - st[0] * a
             set_flag(pair_acts_out, k, wp.uint8(0))
-            set_flag(pair_loads_out, k, wp.uint8(0))
             set_number(hit_pair_out, found, k)
             set_closest(hit_closest_out, found, st)
             found += wp.where(wp.length_sq(c) < largest_reach * largest_reach, 1, 0)

@@ -25,9 +25,6 @@ from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
 
-# What a pair does to its nodes, 0 for nothing: a push with friction, loads beside it, both.
-PUSH, BESIDE, BOTH = wp.uint8(1), wp.uint8(2), wp.uint8(3)
-
 
 @cache
 def make_capsule_pairs(name: str, features: CapsuleFeatures):
@@ -50,7 +47,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     pair_of, _ = make_items(vec2)
     _, set_four = make_items(vec4)
     _, set_nine = make_items(mat33)
-    _, set_real = make_items(real)
     _, set_flag = make_items(wp.uint8)
 
     @wp.func
@@ -113,10 +109,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
-        pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
-        pair_loads: wp.array(dtype=wp.uint8),
         pair_hit_out: wp.array(dtype=wp.int32),
         hit_moment_out: wp.array(dtype=vec3),
         hit_beside_out: wp.array(dtype=mat33),
@@ -209,8 +203,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now
             set_flag(pair_acts, k, wp.uint8(1))
-            set_flag(pair_loads, k, wp.static(BOTH))
-            set_real(pair_push_out, k, push[0])
             set_vector(pair_force_out, k, force - (size - push[0]) * n + springs[0])
             set_number(pair_hit_out, k, hit)
             set_vector(hit_moment_out, hit, wp.cross(n, force))
@@ -249,7 +241,7 @@ def make_gather(name: str, closed: bool):
         pair_j: wp.array(dtype=wp.int32),
         pair_force: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
-        pair_loads: wp.array(dtype=wp.uint8),
+        pair_acts: wp.array(dtype=wp.uint8),
         pair_hit: wp.array(dtype=wp.int32),
         hit_moment: wp.array(dtype=vec3),
         hit_beside: wp.array(dtype=mat33),
@@ -261,12 +253,12 @@ def make_gather(name: str, closed: bool):
         found = begin
         for k in range(out_start[first_segment], out_start[end_segment]):
             set_number(acting, found, k)
-            found += wp.where(flag(pair_loads, k) != wp.uint8(0), 1, 0)
+            found += wp.where(flag(pair_acts, k) != wp.uint8(0), 1, 0)
         incoming = found
         for slot in range(in_start[first_segment], in_start[end_segment]):
             k = number(in_pair, slot)
             set_number(acting, found, k)
-            found += wp.where(flag(pair_loads, k) != wp.uint8(0), 1, 0)
+            found += wp.where(flag(pair_acts, k) != wp.uint8(0), 1, 0)
         for slot in range(begin, found):
             k = number(acting, slot)
             segment = number(pair_i, k)
@@ -277,32 +269,29 @@ def make_gather(name: str, closed: bool):
             if wp.static(closed):
                 if node == last:
                     end = first
-            loads = flag(pair_loads, k)
-            if loads != wp.static(BESIDE):
-                arms = four(pair_arms, k)
-                force = vector(pair_force, k)
-                part = arms[0]
-                arm = arms[2]
-                if slot >= incoming:
-                    force = -force
-                    part = arms[1]
-                    arm = arms[3]
-                moment = arm * vector(hit_moment, number(pair_hit, k))
-                set_vector(node_force, node, vector(node_force, node) + (one - part) * force)
-                set_vector(node_moment, node, vector(node_moment, node) + (one - part) * moment)
-                set_vector(node_force, end, vector(node_force, end) + part * force)
-                set_vector(node_moment, end, vector(node_moment, end) + part * moment)
-            if loads != wp.static(PUSH):
-                beside = nine(hit_beside, number(pair_hit, k))
-                if slot < incoming:
-                    set_vector(node_force, node, vector(node_force, node) + beside[0])
-                    set_vector(node_force, end, vector(node_force, end) + beside[1])
-                else:
-                    set_vector(node_force, node, vector(node_force, node) + beside[2])
-                    set_vector(
-                        node_force,
-                        end,
-                        vector(node_force, end) - (beside[0] + beside[1] + beside[2]),
-                    )
+            arms = four(pair_arms, k)
+            force = vector(pair_force, k)
+            part = arms[0]
+            arm = arms[2]
+            if slot >= incoming:
+                force = -force
+                part = arms[1]
+                arm = arms[3]
+            moment = arm * vector(hit_moment, number(pair_hit, k))
+            set_vector(node_force, node, vector(node_force, node) + (one - part) * force)
+            set_vector(node_moment, node, vector(node_moment, node) + (one - part) * moment)
+            set_vector(node_force, end, vector(node_force, end) + part * force)
+            set_vector(node_moment, end, vector(node_moment, end) + part * moment)
+            beside = nine(hit_beside, number(pair_hit, k))
+            if slot < incoming:
+                set_vector(node_force, node, vector(node_force, node) + beside[0])
+                set_vector(node_force, end, vector(node_force, end) + beside[1])
+            else:
+                set_vector(node_force, node, vector(node_force, node) + beside[2])
+                set_vector(
+                    node_force,
+                    end,
+                    vector(node_force, end) - (beside[0] + beside[1] + beside[2]),
+                )
 
     return gather_pairs

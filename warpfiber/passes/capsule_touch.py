@@ -40,7 +40,7 @@ def make_capsule_touch(name: str, closed: bool = False):
     side_share, tip_share = make_capsule_patch(name)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     near, least_sine, both_ways = real(END_TOLERANCE[name]), real(SMALLEST_SINE), real(BOTH_WAYS)
-    turning = real(TURNING_SINE)
+    turning, tiny = real(TURNING_SINE), real(1.0e-30)
     two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
 
     @wp.func
@@ -75,22 +75,26 @@ def make_capsule_touch(name: str, closed: bool = False):
         signed = wp.dot(a, b) / (wp.length(a) * wp.length(b))
         cosine = wp.abs(signed)
         sigma = wp.where(signed < zero, -one, one)
-        if cosine >= both_ways:
-            return side_share(delta, a, b, reach, modulus, ki, kj, sigma, one, zero)
-        weight = half + cosine
-        share = side_share(delta, a, b, reach, modulus, ki, kj, sigma, weight, one)
-        more = side_share(delta, a, b, reach, modulus, ki, kj, -sigma, one - weight, one)
-        energy = share.energy + more.energy
-        if energy > zero:
-            share.s = (share.energy * share.s + more.energy * more.s) / energy
-            share.t = (share.energy * share.t + more.energy * more.t) / energy
-        share.energy = energy
-        share.stiffness += more.stiffness
-        share.damped += more.damped
-        share.depth = wp.max(share.depth, more.depth)
-        share.by_delta += more.by_delta
-        share.by_a += more.by_a
-        share.by_b += more.by_b
+        ways = wp.where(cosine >= both_ways, 1, 2)
+        share = PatchShare()
+        for way in range(ways):
+            weight = wp.where(ways == 1, one, half + cosine)
+            slope = wp.where(ways == 1, zero, one)
+            if way == 1:
+                weight = one - weight
+                sigma = -sigma
+            more = side_share(delta, a, b, reach, modulus, ki, kj, sigma, weight, slope)
+            energy = share.energy + more.energy
+            part = more.energy / wp.max(energy, tiny)
+            share.s += part * (more.s - share.s)
+            share.t += part * (more.t - share.t)
+            share.energy = energy
+            share.stiffness += more.stiffness
+            share.damped += more.damped
+            share.depth = wp.max(share.depth, more.depth)
+            share.by_delta += more.by_delta
+            share.by_a += more.by_a
+            share.by_b += more.by_b
         return share
 
     @wp.func

@@ -21,7 +21,7 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 # Arguments of the sweep that are arrays.
 ARRAYS = """
     groups fiber_group segment_fiber lattice out_start part_start near_count near_pair near_i near_j
-    near_image pair_i pair_j pair_image place node_velocity node_spin step pair_acts pair_push
+    near_image pair_i pair_j pair_image place node_velocity node_spin step pair_acts
     pair_force pair_arms pair_memory pair_step contact_load contact_touch status
 """.split()
 
@@ -60,7 +60,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
-        pair_push: wp.array(dtype=real),
         pair_force: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
@@ -97,7 +96,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
         pair_acts: wp.array(dtype=wp.uint8),
-        pair_push_out: wp.array(dtype=real),
         pair_force_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
@@ -132,7 +130,6 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             node_spin,
             step,
             pair_acts,
-            pair_push_out,
             pair_force_out,
             pair_arms_out,
             pair_memory,

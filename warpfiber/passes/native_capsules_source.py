@@ -234,7 +234,6 @@ _LAW = """
             }
             if (keeps) {
                 pair_acts[k] = 1;
-                pair_push[k] = ((const T*)&force)[l];
                 T* f = (T*)pair_force + 3 * k;
                 T* arms = (T*)pair_arms + 4 * k;
                 for (int c = 0; c < 3; ++c) f[c] = ((const T*)(&whole.x + c))[l];

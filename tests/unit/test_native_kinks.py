@@ -14,13 +14,12 @@ import pytest
 from tests.bonded_crowd import RADIUS, crowd
 from tests.unit.test_native_bonds import PAIR_BOUND
 from warpfiber.methods.bonded_launches import pair_launches
-from warpfiber.passes.capsule_pairs import BESIDE, PUSH
 from warpfiber.passes.executor import load_kernels
 from warpfiber.passes.native_capsules_source import LINE, PARTS
 
 
 def kinked(precision: str, seed: int) -> Any:
-    """Method of a crowd whose nodes are moved at random: kinks everywhere, hollows in many."""
+    """Method of a crowd whose nodes are moved at random: kinks everywhere."""
     sim = crowd(precision)
     sim.prepare()
     method: Any = sim.method
@@ -44,20 +43,18 @@ def plain_loads(sim: Any) -> tuple[np.ndarray, np.ndarray]:
     contacts = method.contacts
     i, j, _ = method.list.host_pairs()
     node = sim.model.segment_node.numpy()
-    hits, marks = contacts.pair_hit.numpy(), contacts.loads.numpy()[: len(i)]
+    hits, marks = contacts.pair_hit.numpy(), contacts.acts.numpy()[: len(i)]
     loads = np.zeros((sim.model.node_count, 3))
     for k in np.flatnonzero(marks):
         first = node[i[k]], node[j[k]]
-        if marks[k] != int(BESIDE):
-            force = contacts.force.numpy()[k].astype(float)
-            s, t = contacts.arms.numpy()[k][:2].astype(float)
-            for at, part, on in zip(first, (s, t), (force, -force), strict=True):
-                loads[at : at + 2] += np.array([[1.0 - part], [part]]) * on
-        if marks[k] != int(PUSH):
-            rows = contacts.beside.numpy()[hits[k]].astype(float)
-            loads[first[0] : first[0] + 2] += rows[:2]
-            loads[first[1]] += rows[2]
-            loads[first[1] + 1] -= rows.sum(axis=0)
+        force = contacts.force.numpy()[k].astype(float)
+        s, t = contacts.arms.numpy()[k][:2].astype(float)
+        for at, part, on in zip(first, (s, t), (force, -force), strict=True):
+            loads[at : at + 2] += np.array([[1.0 - part], [part]]) * on
+        rows = contacts.beside.numpy()[hits[k]].astype(float)
+        loads[first[0] : first[0] + 2] += rows[:2]
+        loads[first[1]] += rows[2]
+        loads[first[1] + 1] -= rows.sum(axis=0)
     return loads, marks
 
 
