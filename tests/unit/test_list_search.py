@@ -184,16 +184,19 @@ def test_skin_follows_the_motion(start: Start) -> None:
 
 
 def test_pairs_cost_by_method(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An explicit step does less per listed pair than an implicit one, so its skin is thicker.
+    """An implicit step passes over most pairs of its list, so a thicker skin costs it less.
 
     Bonded spheres in vectors look at near pairs in every step, at all others hardly ever.
     """
     kind = Kind(2, 4.0)
     fibers, _ = random_fibers((kind,), 60, [34.0] * 3, seed=45, spread=5.0)
     explicit = cell(start, (kind,), fibers, flow=SHEAR, box={"size": [34.0] * 3}).method.skin
-    assert explicit.pair_cost == PAIR_COST < STEP_PAIR_COST
-    implicit = dataclasses.replace(explicit, pair_cost=STEP_PAIR_COST)
-    assert implicit.choose(10, 1.0) < explicit.choose(10, 1.0)
+    assert explicit.pair_cost == PAIR_COST > STEP_PAIR_COST
+    skins = [
+        dataclasses.replace(explicit, pair_cost=k, use=0.06) for k in (STEP_PAIR_COST, PAIR_COST)
+    ]
+    thicker = [skin.cost(1.2, 4.0) - skin.cost(0.6, 4.0) for skin in skins]
+    assert thicker[0] < thicker[1]
     for method in METHODS:
         sim = Simulation(meeting_scene(method, 75), workers=1)
         assert sim.method.skin.pair_cost == STEP_PAIR_COST

@@ -36,6 +36,7 @@ def chosen(sim: Simulation, native: bool) -> tuple[Any, Any, Any]:
     kernel = make_pair_motion(model.precision.name, True, native=native)
     dim = launch.dim if native else model.segment_count
     rows.pair_slots.fill_(77)
+    rows.pairs_known.zero_()  # every pair is measured
     wp.launch(kernel, dim=dim, inputs=[0, *launch.inputs], device=model.device)
     pairs = sim.method.list.pair_count  # type: ignore[union-attr]
     before = rows.pair_slots.numpy()[:pairs].copy()
