@@ -193,7 +193,7 @@ _FORCES = """
     V inverse0 = V(T(0));
     M torn = V(T(1)) < T(0);
     for (int k = 0; k < segments; ++k) {
-        ask_to_write(k, node_pos, node_velocity);
+        ask(k, node_pos, node_velocity);
         const V3 x1 = get(x, k + 1), v1 = get(v, k + 1);
         const V3 edge = x1 - x0;
         const V d1 = __builtin_elementwise_sqrt(edge.dot(edge));
@@ -311,11 +311,6 @@ _COMING = """
         if (k < lines)
             for (int l = 0; l < W; ++l)
                 (__builtin_prefetch((const T*)arrays + coming[l] + LINE * k, 0, 2), ...);
-    };
-    auto ask_to_write = [&](int k, auto... arrays) {
-        if (k < lines)
-            for (int l = 0; l < W; ++l)
-                (__builtin_prefetch((const T*)arrays + coming[l] + LINE * k, 1, 2), ...);
     };
 """
 
