@@ -8,12 +8,19 @@ Source: the patch of `capsule_touch`, with the largest reach of all pairs.
 SWEEP = """
     const int begin = out_start[part_start[part]], end = begin + near_count[part];
     if (keeps) __builtin_memset(pair_acts + begin, 0, out_start[part_start[part + 1]] - begin);
-    struct Whole { enum { IS_SHARED = false }; };
-    struct Shared { enum { IS_SHARED = true }; };
-    constexpr int ROOM = 2 * W;
-    // pairs that may have a part of a patch lie behind those that have a whole one
-    int hit_at[2 * ROOM], wholes = 0, parts = 0;
-    T hit_s[2 * ROOM], hit_t[2 * ROOM];
+    struct Whole {
+        enum { IS_SHARED = false, WAYS = 1, HAS_TIPS = false };
+        typedef Untipped Tips;
+    };
+    struct OneWay : Whole { enum { IS_SHARED = true }; };
+    struct TwoWays : OneWay { enum { WAYS = 2 }; };
+    struct AtTips : OneWay {
+        enum { WAYS = 0, HAS_TIPS = true };
+        typedef Tipped Tips;
+    };
+    constexpr int ROOM = 2 * W, KINDS = 4;
+    int hit_at[KINDS * ROOM], hits_of[KINDS] = {0, 0, 0, 0};
+    T hit_s[KINDS * ROOM], hit_t[KINDS * ROOM];
     auto run = [&](auto kind, int from, int& hits) {
         law(kind, hit_at + from, hit_s + from, hit_t + from, W);
         hits -= W;
@@ -54,10 +61,16 @@ SWEEP = """
         const V both = root(aa * bb), wide = T(2) * (both - (ab < T(0) ? -ab : ab));
         const V most = (largest_reach * largest_reach - square) * both;
         const M whole = (in_s * in_s * aa * wide > most) & (in_t * in_t * bb * wide > most);
-        const unsigned shared = bits(~whole);
+        const M at_tip = (s < T(0.5) ? tipped(code_i, 1) : tipped(code_i, 2))
+            | (t < T(0.5) ? tipped(code_j, 1) : tipped(code_j, 2));
+        const V size = ab < T(0) ? -ab : ab;
+        const unsigned shared = bits(~whole), tips = bits(at_tip);
+        const unsigned crossed = bits(size < BOTH_WAYS * both);
         for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
-            const int slot = shared >> l & 1 ? ROOM + parts++ : wholes++;
+            const int kind = !(shared >> l & 1) ? 0
+                : (tips >> l & 1 ? 3 : (crossed >> l & 1 ? 2 : 1));
+            const int slot = kind * ROOM + hits_of[kind]++;
             hit_at[slot] = first + l;
             hit_s[slot] = ((const T*)&s)[l];
             hit_t[slot] = ((const T*)&t)[l];
@@ -78,9 +91,13 @@ SWEEP = """
                 __builtin_prefetch(kept_now + 4 * k, 1);
             }
         }
-        if (wholes >= W) run(Whole(), 0, wholes);
-        if (parts >= W) run(Shared(), ROOM, parts);
+        if (hits_of[0] >= W) run(Whole(), 0, hits_of[0]);
+        if (hits_of[1] >= W) run(OneWay(), ROOM, hits_of[1]);
+        if (hits_of[2] >= W) run(TwoWays(), 2 * ROOM, hits_of[2]);
+        if (hits_of[3] >= W) run(AtTips(), 3 * ROOM, hits_of[3]);
     }
-    run_rest(Whole(), 0, wholes);
-    run_rest(Shared(), ROOM, parts);
+    run_rest(Whole(), 0, hits_of[0]);
+    run_rest(OneWay(), ROOM, hits_of[1]);
+    run_rest(TwoWays(), 2 * ROOM, hits_of[2]);
+    run_rest(AtTips(), 3 * ROOM, hits_of[3]);
 """
