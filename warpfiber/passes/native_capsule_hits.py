@@ -1,6 +1,8 @@
 """C++ text that collects near pairs of bonded spheres within reach for their law of contact.
 
-Pairs whose patch lies within both segments are collected apart: their law is shorter.
+Pairs are collected apart by what of the law they need: whether their patch lies within both
+segments, at the end of a fiber, or across which mean directions. What a step reads and writes is
+more than the second cache holds; it is fetched there, since asking for the first one stands still.
 Source: the patch of `capsule_touch`, with the largest reach of all pairs.
 """
 
@@ -18,6 +20,7 @@ SWEEP = """
         enum { WAYS = 0, HAS_TIPS = true };
         typedef Tipped Tips;
     };
+    auto fetch = [](const void* from) { __builtin_prefetch(from, 0, 2); };
     constexpr int ROOM = 2 * W, KINDS = 4;
     int hit_at[KINDS * ROOM], hits_of[KINDS] = {0, 0, 0, 0};
     T hit_s[KINDS * ROOM], hit_t[KINDS * ROOM];
@@ -46,12 +49,16 @@ SWEEP = """
         __builtin_memcpy(&code_j, near_j + first, sizeof(I));
         __builtin_memcpy(&images, near_image + first, sizeof(I));
         const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
-        const int* const later = near_j + first + (is_large ? AHEAD : 1) * W;
+        const int* const later = near_j + first + AHEAD * W;
         for (int l = 0; l < W; ++l) {
             const double* const x = (const double*)place + 3L * (later[l] >> TIP_BITS);
-            __builtin_prefetch(x);
-            if (is_large) __builtin_prefetch(x + 5);
+            fetch(x);
+            fetch(x + 5);
         }
+        fetch(near_i + first + FAR * W);
+        fetch(near_j + first + FAR * W);
+        fetch(near_image + first + FAR * W);
+        fetch(near_pair + first + FAR * W);
         V s, t, aa, bb, ab;
         const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aa, bb, ab);
         const V square = c.dot(c), rest_s = T(1) - s, rest_t = T(1) - t;
@@ -77,18 +84,22 @@ SWEEP = """
             const long k = near_pair[first + l];
             const long i = ((const int*)&from_i)[l], j = ((const int*)&from_j)[l];
             if constexpr (HAS_DASHPOT || HAS_FRICTION) {
-                __builtin_prefetch((const T*)node_velocity + 3 * i);
-                __builtin_prefetch((const T*)node_velocity + 3 * j);
-                __builtin_prefetch((const T*)node_spin + 3 * i);
-                __builtin_prefetch((const T*)node_spin + 3 * j);
+                fetch((const T*)node_velocity + 3 * i);
+                fetch((const T*)node_velocity + 3 * j);
+                fetch((const T*)node_spin + 3 * i);
+                fetch((const T*)node_spin + 3 * j);
+                fetch((const T*)node_velocity + 3 * j + 5);
+                fetch((const T*)node_spin + 3 * j + 5);
             }
-            __builtin_prefetch(load + j, 1);
-            __builtin_prefetch(load + j + 1, 1);
+            fetch(load + i);
+            fetch(load + i + 1);
+            fetch(load + j);
+            fetch(load + j + 1);
             if constexpr (HAS_FRICTION) {
-                __builtin_prefetch(written_last + k);
-                __builtin_prefetch(written_now + k, 1);
-                __builtin_prefetch(kept_last + 4 * k);
-                __builtin_prefetch(kept_now + 4 * k, 1);
+                fetch(written_last + k);
+                fetch(written_now + k);
+                fetch(kept_last + 4 * k);
+                fetch(kept_now + 4 * k);
             }
         }
         if (hits_of[0] >= W) run(Whole(), 0, hits_of[0]);

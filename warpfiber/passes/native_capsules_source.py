@@ -20,8 +20,8 @@ from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_
 LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
-LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
-AHEAD = 4  # blocks of pairs whose nodes are fetched then, else one
+AHEAD = 4  # blocks of pairs whose nodes are fetched
+FAR = 16  # the same of the list itself
 READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
@@ -39,6 +39,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
         "PARTS": PARTS,
         "TIP_BITS": TIP_BITS,
         "AHEAD": AHEAD,
+        "FAR": FAR,
         "SLOT_HALT": HALT,
     }
     numbers |= image_constants()
@@ -253,7 +254,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
     const int kept_size = pair_step.shape[1], node_count = place.shape[0];
-    const bool one_group = groups.shape[0] == 1, is_large = node_count > {LARGE};
+    const bool one_group = groups.shape[0] == 1;
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
