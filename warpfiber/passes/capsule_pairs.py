@@ -146,17 +146,16 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             reach = gi.radius + gj.radius
             if wp.length_sq(c) >= reach * reach:
                 continue
-            push, felt, springs = normal_contact(gi, gj, at_i, at_j, delta, a, b, st)
+            push, felt, n, springs, on_i, on_j = normal_contact(
+                gi, gj, at_i, at_j, delta, a, b, st, c
+            )
             if felt[2] <= zero:
                 continue
             depth = felt[0]
             s = push[2]
             t = push[3]
-            c = delta + t * b - s * a
-            distance = wp.length(c)
-            n = c / distance
-            arm_i = half * (distance + gi.radius - gj.radius)
-            arm_j = distance - arm_i
+            arm_i = half * (felt[3] + gi.radius - gj.radius)
+            arm_j = felt[3] - arm_i
             size = push[0]
             force = vec3(zero, zero, zero)
             if wp.static(has_dashpot or has_friction):
@@ -203,10 +202,10 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now
             set_flag(pair_acts, k, wp.uint8(1))
-            set_vector(pair_force_out, k, force - (size - push[0]) * n + springs[0])
+            set_vector(pair_force_out, k, force - (size - push[0]) * n + springs)
             set_number(pair_hit_out, k, hit)
             set_vector(hit_moment_out, hit, wp.cross(n, force))
-            set_nine(hit_beside_out, hit, wp.matrix_from_rows(springs[1], -springs[1], springs[2]))
+            set_nine(hit_beside_out, hit, wp.matrix_from_rows(on_i, -on_i, on_j))
             set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
 
     return capsule_pairs
