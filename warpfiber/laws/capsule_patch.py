@@ -45,11 +45,11 @@ def make_capsule_patch(name):
     segments), depth, and the energy's gradient by delta and by the segments.
     """
     p = precision(name)
-    real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     zero, half, one, two, four = (real(x) for x in (0.0, 0.5, 1.0, 2.0, 4.0))
     third, fifth, power = real(1.0 / 3.0), real(0.2), real(2.5)
-    tiny, least_root = real(1.0e-30), real(1.0e-15)
-    turning, further = real(TURNING_SINE), real(0.5 * BEYOND)
+    tiny = real(1.0e-30)
+    further = real(0.5 * BEYOND)
     near, parallel2 = real(PARALLEL[name]), real(PARALLEL[name] ** 2)
 
     @wp.func
@@ -78,15 +78,6 @@ def make_capsule_patch(name):
         )
 
     @wp.func
-    def overlapping(q: real, slope: real, ww: real) -> vec2:
-        """How far slices overlap, without differences of numbers that are nearly equal."""
-        root = wp.sqrt(slope * slope + ww * q)
-        down = wp.max(root - slope, least_root)
-        up = wp.max(root + slope, least_root)
-        unit = q / (down * up)
-        return vec2(-unit * up, unit * down)
-
-    @wp.func
     def beyond_zero(x: real, rounding: real) -> real:
         """1 beyond, 0 before; half where ends face each other and rounding would decide."""
         return wp.where(x > rounding, one, wp.where(x < -rounding, zero, half))
@@ -104,20 +95,19 @@ def make_capsule_patch(name):
         rigidity: real,
         steepness: real,
         cosine: real,
-        sine: real,
-        cross: real,
-        weight: real,
+        wider: real,
+        by_ww: real,
         leading: real,
         forward: wp.bool,
     ):
-        """Of slices across e; forward: sigma = 1; rigidity = E* f sine; steepness = d ln f / d ln P.
+        """Of slices across e; forward: sigma = 1; rigidity = w E* f sine.
 
-        by_la = 1 / la; by_lb = sigma / lb; leading = d ln w / d cosine.
+        by_la = 1 / la; by_lb = sigma / lb; steepness = -d ln (f sine) / d cosine / cosine; wider =
+        1 / (1 + cosine); by_ww = 1 / w^2; leading = d ln w / d cosine.
         """
         nothing = vec3(zero, zero, zero)
         e = along_a + along_b
         w = along_b - along_a
-        wider = one / (one + cosine)
         offset = -wp.dot(delta, e) * wider
         d0 = delta + offset * along_b
         # where b begins and ends along a
@@ -127,10 +117,8 @@ def make_capsule_patch(name):
         high = wp.min(la, last)
         if high <= low:
             return zero, zero, zero, zero, zero, zero, nothing, nothing, nothing
-        ww = wp.dot(w, w)
-        deepest = half * (low + high)
-        if ww > parallel2:
-            deepest = -wp.dot(d0, w) / ww
+        ww = wp.max(wp.dot(w, w), parallel2)
+        deepest = wp.where(ww > parallel2, -wp.dot(d0, w) * by_ww, half * (low + high))
         beyond = further * (la + lb)
         ahead = wp.min(zero, first) - beyond
         behind = wp.max(la, last) + beyond
@@ -143,29 +131,32 @@ def make_capsule_patch(name):
         wide = reach + h
         q = (reach - h) * wide
         slope = wp.dot(nearest, w)
-        reached = overlapping(q, slope, ww)
+        # where slices overlap; along parallel segments far beyond both
+        root = wp.sqrt(slope * slope + ww * q)
         begin = low - u_h
         end = high - u_h
-        x1 = wp.max(begin, reached[0])
-        x2 = wp.min(end, reached[1])
+        x1 = wp.max(begin, -(root + slope) * by_ww)
+        x2 = wp.min(end, (root - slope) * by_ww)
         if x2 - x1 <= near * la:  # ends that face each other share nothing yet
             return zero, zero, zero, zero, zero, zero, nothing, nothing, nothing
         sums = slices(q, slope, ww, x1, x2)
-        by_wide = one / wide
+        by_h = one / (h * wide)
+        by_wide = by_h * h
         by_root = wp.sqrt(by_wide)
         # y = 2 tan(angle / 2) times the way along the mean direction
-        form = rigidity * wp.sqrt(two * wider)
-        rigid = weight * form
+        rigid = rigidity * wp.sqrt(two * wider)
         scale = half * rigid * by_wide * by_wide * by_root
         energy = scale * sums[0]
         stiffness = rigid * (x2 - x1) * by_root
-        damped = stiffness * (x2 - x1) / wp.min(reached[1] - reached[0], half * (la + lb))
-        place = u_h + sums[2] / wp.max(sums[1], tiny)
+        whole_patch = wp.min(two * root * by_ww, half * (la + lb))
+        parts = one / wp.max(whole_patch * sums[1], tiny)
+        damped = stiffness * (x2 - x1) * (parts * sums[1])
+        place = u_h + sums[2] * (parts * whole_patch)
 
         # dE by D, at U = 0 and times U; by h; by the ends of a and b
         pull = -four * scale
-        by_h = (-power * energy * by_wide / h) * nearest
-        whole = (pull * sums[1]) * nearest + (pull * sums[2]) * w + by_h
+        deeper = (-power * energy * by_h) * nearest
+        whole = (pull * sums[1]) * nearest + (pull * sums[2]) * w + deeper
         moment = (pull * sums[2]) * nearest + (pull * sums[3]) * w + u_h * whole
         o = overlap_at(q, slope, ww, x2)
         at_high = wp.where(x2 >= end, scale * o * o, zero)
@@ -174,23 +165,19 @@ def make_capsule_patch(name):
         at_first = wp.where(x1 <= begin, scale * o * o, zero)
         at_first *= -beyond_zero(first, near * la)
         by_length_a = at_high - at_last
-        held = wp.dot(by_h, w)
-        stretched = zero
-        if deepest < ahead:
-            at_first += beyond_zero(-first, near * la) * held
-            stretched = -further * held
-        if deepest > behind:
-            ends = beyond_zero(last - la, near * la) * held
-            at_last += ends
-            by_length_a += held - ends
-            stretched = further * held
+        held = wp.dot(deeper, w)
+        # where the deepest slice is beyond both
+        is_ahead = deepest < ahead
+        is_behind = deepest > behind
+        at_first += wp.where(is_ahead, beyond_zero(-first, near * la) * held, zero)
+        ends = beyond_zero(last - la, near * la)
+        at_last += wp.where(is_behind, ends * held, zero)
+        by_length_a += wp.where(is_behind, (one - ends) * held, zero)
+        stretched = wp.where(is_behind, further, wp.where(is_ahead, -further, zero)) * held
         by_length_a += stretched
         by_length_b = stretched + wp.where(forward, at_last, -at_first)
         # angle: f, w and the way across
-        by_cosine = half * wider
-        if cross > turning:
-            by_cosine += (two * steepness + one) * cosine / (sine * sine)
-        by_cosine = energy * (leading - by_cosine)
+        by_cosine = energy * (leading - half * wider - steepness * cosine)
         # slices turn with the mean direction: d0 stays across e
         turn = -wider * (wp.dot(whole, along_b) - at_first - at_last)
         by_delta = whole + turn * e
@@ -224,19 +211,19 @@ def make_capsule_patch(name):
         wide = reach + h
         q = (reach - h) * wide
         slope = wp.dot(nearest, along)
-        reached = overlapping(q, slope, one)
-        x1 = wp.max(-t_h, reached[0])
-        x2 = wp.min(length - t_h, reached[1])
+        root = wp.sqrt(slope * slope + q)
+        x1 = wp.max(-t_h, -root - slope)
+        x2 = wp.min(length - t_h, root - slope)
         sums = slices(q, slope, one, x1, x2)
-        by_wide = one / wide
+        by_h = one / (h * wide)
+        by_wide = by_h * h
         by_root = wp.sqrt(by_wide)
         scale = half * rigidity * by_wide * by_wide * by_root
         energy = scale * sums[0]
         stiffness = rigidity * (x2 - x1) * by_root
-        damped = stiffness * (x2 - x1) / wp.min(reached[1] - reached[0], length)
+        damped = stiffness * (x2 - x1) / wp.min(two * root, length)
         pull = -four * scale
-        by_h = (-power * energy * by_wide / h) * nearest
-        by_delta = (pull * sums[1]) * nearest + (pull * sums[2]) * along + by_h
+        by_delta = (pull * sums[1] - power * energy * by_h) * nearest + (pull * sums[2]) * along
         moment = (pull * sums[2]) * nearest + (pull * sums[3]) * along + t_h * by_delta
         return (
             energy,

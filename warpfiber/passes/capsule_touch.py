@@ -13,6 +13,7 @@ import warp as wp
 from warpfiber.laws.capsule_contact import SMALLEST_SINE, make_capsule_contact
 from warpfiber.laws.capsule_patch import (
     BOTH_WAYS,
+    PARALLEL,
     TURNING_SINE,
     make_capsule_patch,
 )
@@ -39,6 +40,7 @@ def make_capsule_touch(name: str, closed: bool = False):
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     near, least_sine, both_ways = real(END_TOLERANCE[name]), real(SMALLEST_SINE), real(BOTH_WAYS)
     turning, tiny = real(TURNING_SINE), real(1.0e-30)
+    parallel2 = real(PARALLEL[name] ** 2)
     two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
 
     @wp.func
@@ -64,8 +66,7 @@ def make_capsule_touch(name: str, closed: bool = False):
         """Of segments nearest at st, within reach there; gap from the point of i to that of j."""
         reach = gi.radius + gj.radius
         modulus = one / (gi.compliance + gj.compliance)
-        ki = one / gi.radius
-        kj = one / gj.radius
+        both_radii = gi.radius * gj.radius
         la = wp.length(a)
         lb = wp.length(b)
         by_both = one / (la * lb)
@@ -77,21 +78,21 @@ def make_capsule_touch(name: str, closed: bool = False):
         cosine = wp.min(wp.abs(signed), one)
         cross = wp.length(wp.cross(along_a, along_b))
         sine = wp.max(cross, least_sine)
-        form = hertz_factor(curvatures(0, ki, kj, sine))
+        by_sine2 = one / (sine * sine)
+        form = hertz_factor(curvatures(0, gi.radius, gj.radius, sine), both_radii)
         rigidity = modulus * form[0]
-        distance = wp.length(gap)
-        depth = wp.max(reach - distance, zero)
         inside = wp.min(wp.min(st[0], one - st[0]) * la, wp.min(st[1], one - st[1]) * lb)
         # half of the patch along either fiber is its root
-        patch2 = depth * (reach + distance)
+        patch2 = reach * reach - wp.dot(gap, gap)
         inside2 = two * inside * inside * wp.max(one - cosine, near)
         if inside2 > patch2 and inside > near * wp.max(la, lb):
+            distance = wp.length(gap)
+            depth = wp.max(reach - distance, zero)
             stiffness = two * rigidity * wp.sqrt(depth)
             size = two_thirds * stiffness * depth
             energy = two_fifths * size * depth
             # a wider angle stores less: d ln P = -2 cos d cos / sin^2
-            twist = wp.where(cross > turning, -two * form[1] * energy * signed, zero)
-            twist = twist / (sine * sine)
+            twist = wp.where(cross > turning, -two * form[1] * energy * signed * by_sine2, zero)
             n = (one / distance) * gap
             return (
                 vec4(size, stiffness, st[0], st[1]),
@@ -113,11 +114,22 @@ def make_capsule_touch(name: str, closed: bool = False):
         by_b = vec3(zero, zero, zero)
         forward = signed >= zero
         along = cosine
+        across_b = wp.where(forward, one, -one) * along_b
+        w = across_b - along_a
+        # 1 / (1 + cosine), 1 / w^2; slices the other way have e and w in each other's place
+        ww = wp.max(wp.dot(w, w), parallel2)
+        by_ends = one / ((one + cosine) * ww)
+        wider = by_ends * ww
+        by_ww = by_ends * (one + cosine)
+        steepness = wp.where(cross > turning, (two * form[1] + one) * by_sine2, zero)
+        rigidity *= sine
         ways = wp.where(cosine >= both_ways, 1, 2)
         weight = wp.where(ways == 1, one, half + cosine)
-        for _way in range(ways):
+        for way in range(ways):
             sigma = wp.where(forward, one, -one)
-            leading = wp.where(ways == 1, zero, one / weight)
+            leading = zero
+            if ways == 2:
+                leading = one / weight
             e_more, k_more, d_more, s_more, t_more, deep_more, by_d, by_i, by_j = side_share(
                 delta,
                 along_a,
@@ -127,18 +139,20 @@ def make_capsule_touch(name: str, closed: bool = False):
                 by_la,
                 sigma * by_lb,
                 reach,
-                rigidity * sine,
-                form[1],
+                weight * rigidity,
+                steepness,
                 along,
-                sine,
-                cross,
-                weight,
+                wider,
+                by_ww,
                 leading,
                 forward,
             )
+            part = one
+            if way == 1:
+                part = e_more / wp.max(energy + e_more, tiny)
             energy += e_more
-            s += e_more * s_more
-            t += e_more * sigma * t_more
+            s += part * (by_la * s_more - s)
+            t += part * (sigma * by_lb * t_more - t)
             stiffness += k_more
             damped += d_more
             deep = wp.max(deep, deep_more)
@@ -147,10 +161,10 @@ def make_capsule_touch(name: str, closed: bool = False):
             by_b += by_j
             forward = not forward
             along = -along
-            weight = one - weight
-        mean = one / wp.max(energy, tiny)
-        s *= mean * by_la
-        t *= mean * by_lb
+            weight = wp.max(one - weight, tiny)
+            before = wider
+            wider = two * by_ww
+            by_ww = half * before
 
         is_tip_i = is_tip(gi, at_i, st[0])
         is_tip_j = is_tip(gj, at_j, st[1])
@@ -158,7 +172,9 @@ def make_capsule_touch(name: str, closed: bool = False):
             tip_s = wp.where(st[0] < half, zero, one)
             tip_t = wp.where(st[1] < half, zero, one)
             if is_tip_i:
-                round = modulus * hertz_factor(curvatures(1, ki, kj, one))[0]
+                round = (
+                    modulus * hertz_factor(curvatures(1, gi.radius, gj.radius, one), both_radii)[0]
+                )
                 start = delta - tip_s * a
                 e_tip, k_tip, d_tip, t_tip, deep_tip, by_d, by_j = tip_share(
                     start, along_b, lb, reach, round
@@ -174,7 +190,9 @@ def make_capsule_touch(name: str, closed: bool = False):
                     by_a = -tip_s * by_d
                     by_b = by_j
             if is_tip_j:
-                round = modulus * hertz_factor(curvatures(2, ki, kj, one))[0]
+                round = (
+                    modulus * hertz_factor(curvatures(2, gi.radius, gj.radius, one), both_radii)[0]
+                )
                 start = -delta - tip_t * b
                 e_tip, k_tip, d_tip, s_tip, deep_tip, by_d, by_i = tip_share(
                     start, along_a, la, reach, round
@@ -193,7 +211,9 @@ def make_capsule_touch(name: str, closed: bool = False):
                 c = delta + tip_t * b - tip_s * a
                 apart = wp.length(c)
                 deep_tip = wp.max(reach - apart, zero)
-                round = modulus * hertz_factor(curvatures(3, ki, kj, one))[0]
+                round = (
+                    modulus * hertz_factor(curvatures(3, gi.radius, gj.radius, one), both_radii)[0]
+                )
                 k_tip = two * round * wp.sqrt(deep_tip)
                 push = two_thirds * k_tip * deep_tip
                 if two_fifths * push * deep_tip > energy:
