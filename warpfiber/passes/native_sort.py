@@ -15,7 +15,8 @@ from warpfiber.passes.pairs import IMAGE_BITS
 
 # Keys stand in `regions` parts of `stride` places of which only the first count[region] are in use;
 # a negative key belongs to no bin. start[bins] is written by whoever owns the last bin. Workers
-# share the bins so that about as many keys are in those of each, by a sample of the keys.
+# share the bins so that about as many keys are in those of each, by a sample of the keys. Loops
+# that gain nothing by it are not unrolled: they would take as long to compile as all the rest.
 COUNT_KEYS = r"""
     typedef int I __attribute__((ext_vector_type(16)));
     typedef bool B __attribute__((ext_vector_type(16)));
@@ -30,11 +31,13 @@ COUNT_KEYS = r"""
         const int every = keys_used / SAMPLES + 1;
         const float part = (float)PARTS / (float)bins;
         for (int r = 0; r < regions; ++r)
+            #pragma clang loop vectorize(disable) unroll(disable)
             for (int k = 0, used = used_in(r); k < used; k += every) {
                 const int b = key.data[(long long)r * stride + k], c = (int)(part * (float)b);
                 if (b >= 0) weight[c < PARTS ? c : PARTS - 1] += 4;
             }
         for (int c = 0; c < PARTS; ++c) whole += weight[c];
+        #pragma clang loop vectorize(disable) unroll(disable)
         for (int c = PARTS - 1; c >= 0; --c) {
             if ((whole - sum) * workers >= whole * worker) begin = c;
             if ((whole - sum) * workers >= whole * (worker + 1)) end = c;
@@ -47,8 +50,9 @@ COUNT_KEYS = r"""
     for (int b = first; b < last; ++b) start[b] = 0;
     int before = 0, all = 0;
     // bits of up to 64 keys that are in the bins of this worker: which ones is anybody's guess
-    auto mine = [&](const int* keys, int n) -> word_t {
+    auto mine = [&](const int* keys, int n) __attribute__((noinline)) -> word_t {
         word_t in = 0, below = 0, any = 0;
+        #pragma clang loop unroll(disable)
         for (int q = 0; q + 16 <= n; q += 16) {
             I k;
             __builtin_memcpy(&k, keys + q, sizeof(k));
@@ -60,6 +64,7 @@ COUNT_KEYS = r"""
             below |= bits((k >= 0) & (k < first));
             any |= bits(k >= 0);
         }
+        #pragma clang loop vectorize(disable) unroll(disable)
         for (int q = n / 16 * 16; q < n; ++q) {
             const int k = keys[q];
             in |= (word_t)((k >= first) & (k < last)) << q;
@@ -75,6 +80,7 @@ COUNT_KEYS = r"""
         for (int k = 0, used = used_in(r); k < used; k += 64) {
             word_t in = mine(keys + k, used - k < 64 ? used - k : 64);
             if (~in == 0)
+                #pragma clang loop vectorize(disable) unroll(disable)
                 for (int q = 0; q < 64; ++q) ++start[keys[k + q]];
             else
                 for (; in; in &= in - 1) ++start[keys[k + __builtin_ctzll(in)]];
@@ -93,6 +99,7 @@ PLACE_KEYS = r"""
         for (int k = (used - 1) / 64 * 64; k >= 0 && used > 0; k -= 64) {
             word_t in = mine(keys + k, used - k < 64 ? used - k : 64);
             if (~in == 0) {
+                #pragma clang loop vectorize(disable) unroll(disable)
                 for (int at = k + 63; at >= k; --at)
                     place_out.data[--start[keys[at]]] = r * stride + at;
                 continue;
@@ -132,19 +139,21 @@ ORDER_ROWS = (
         if (end - begin <= 8) {
             word_t row[8];
             for (int a = 0; a < 8; ++a) row[a] = ~(word_t)0;
+            #pragma clang loop vectorize(disable) unroll(disable)
             for (int a = 0; a < end - begin; ++a) {
                 const int slot = place_out.data[begin + a];
                 const word_t code = image.data[slot];
-                row[a] = (word_t)partner.data[slot] << 3 + CODE_BITS | code << 3 | a;
+                row[a] = (word_t)partner.data[slot] << (3 + CODE_BITS) | code << 3 | a;
             }
             L all_of;
             __builtin_memcpy(&all_of, row, sizeof(all_of));
+            #pragma clang loop vectorize(disable) unroll(disable)
             for (int a = 0; a < end - begin; ++a) {
                 const B8 less = __builtin_convertvector(all_of < row[a], B8);
                 const int b = begin + __builtin_popcount(__builtin_bit_cast(unsigned char, less));
                 pair_i_out.data[begin + a] = i;
-                pair_j_out.data[b] = (int)(row[a] >> 3 + CODE_BITS);
-                pair_image_out.data[b] = (int)(row[a] >> 3) & (1 << CODE_BITS) - 1;
+                pair_j_out.data[b] = (int)(row[a] >> (3 + CODE_BITS));
+                pair_image_out.data[b] = (int)(row[a] >> 3) & ((1 << CODE_BITS) - 1);
             }
             continue;
         }
