@@ -33,6 +33,7 @@ from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 NEVER = -1e20  # radii: no gap is that small
 GROWTH = 1.3
+SPARE_ROWS = 20_000  # at first, beside one per segment: launches are captured anew when rows grow
 FAR = 1e30  # run units: motion of which nothing is known
 
 
@@ -118,7 +119,7 @@ class ContactRows:
         joined = np.concatenate([[False], fiber[1:] == fiber[:-1], [False]])
         ends = FIRST * ~joined[:-1] + LAST * ~joined[1:]
         self.segment_ends = wp.array(ends, dtype=wp.uint8, device=model.device)
-        self._allocate_rows(capacity or max(64, segments))
+        self._allocate_rows(capacity or max(64, segments + min(segments, SPARE_ROWS)))
         self._fit_pairs()
 
     # -- arrays -----------------------------------------------------------------------------------

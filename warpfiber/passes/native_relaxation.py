@@ -28,7 +28,7 @@ from warpfiber.passes.native_friction import RUB_FORCES, RUB_NAMES, rubbing
 from warpfiber.passes.native_row_order import BEGIN_TEXT, NAMES, ROWS_TEXT, named
 
 OVER = 1.2
-SHARE = 0.5
+SHARE = 0.9
 FINE = 0.02
 # stages of a solve; all but BEGIN and REST by as many threads as parts
 BEGIN, ROWS, PARTS, REST, END = range(5)
