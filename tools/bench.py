@@ -12,7 +12,8 @@
                                                   of explicit steps (parts: see bench_contact.py)
     python tools/bench.py plate [PART ...]        the sliding-plate cell: error of A against time
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
-    --workers W, --repeats N, --method M, --shuffled (engine: large cells numbered in no order),
+    --workers W ... (engine, beads: several alternate, with their ratio), --repeats N, --method M,
+    --shuffled (engine: large cells numbered in no order),
     --dry (print, do not write)
 
 A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
@@ -132,7 +133,8 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             order = "copies" if tiles > 1 else "random"
             if placement is not None and args.shuffled:
                 placement, order = shuffled(placement), "random"
-            yield cell_speed(scene, args, placement) | {"bench": "engine", "numbering": order}
+            for row in cell_speeds(scene, args, placement):
+                yield row | {"bench": "engine", "numbering": order}
 
 
 def tiled(part: Placement, tiles: int, edge: float) -> Placement:
@@ -177,50 +179,92 @@ def beads(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "record.quantities": ["overlap"],
             },
         )
-        row = cell_speed(scene, args) | {"bench": "beads"}
-        ns = row["ns_per_segment_step"] * row["segment_count"] / 20_000
-        yield row | {"bead_steps_per_second": round(1e9 / ns, -3)}
+        for row in cell_speeds(scene, args):
+            ns = row["ns_per_segment_step"] * row["segment_count"] / 20_000
+            yield row | {"bench": "beads", "bead_steps_per_second": round(1e9 / ns, -3)}
 
 
-def cell_speed(
+def cell_speeds(
     scene: wf.Scene, args: argparse.Namespace, placement: Placement | None = None
-) -> dict[str, Any]:
-    """Time of whole steps with list builds (median), by pass, and what the list looks like."""
-    begin = time.perf_counter()
+) -> Iterator[dict[str, Any]]:
+    """Time of whole steps with list builds (median), by pass, and what the list looks like.
+
+    With several numbers of workers their runs alternate, so that what else the machine does slows
+    all alike; rows behind the first have the ratio to it.
+    """
     bead_chain.NATIVE = not args.plain
-    simulation = wf.Simulation(scene, device=args.device, workers=args.workers, placement=placement)
-    placed = time.perf_counter() - begin
-    method, count = simulation.method, simulation.model.segment_count
-    steps = max(20, min(100, 100_000_000 // count))  # of several lists, in cells of all sizes
-    simulation.step(200)  # skins of all sizes have settled
-    whole, lists, builds = [], [], method.list.build_count
-    pruning, prunes = method.search.prune_seconds, method.search.prune_count
+    cells = [Cell(scene, args, workers, placement) for workers in args.worker_counts]
     for _ in range(args.repeats):
-        seconds, building = timed_steps(simulation, steps)
-        whole.append(seconds / steps / count * 1e9)
-        lists.append(building / steps / count * 1e9)
-    builds = method.list.build_count - builds
-    pruning = (method.search.prune_seconds - pruning) / count * 1e9
-    prunes = method.search.prune_count - prunes
-    overlap = simulation.measure()["overlap_max"]
-    row = common(simulation) | {
-        "strain_per_step": round(simulation.dt * scene.flow.rate, 6),
-        "ns_per_segment_step": round(float(np.median(whole)), 1),
-        "ns_spread": [round(min(whole), 1), round(max(whole), 1)],
-        "us_per_step": round(float(np.median(whole)) * count * 1e-3, 1),
-        "ns_list": round(float(np.mean(lists)), 1),
-        "ns_per_build": round((sum(lists) * steps - pruning) / max(1, builds), 1),
-        "ns_per_pruning": round(pruning / max(1, prunes), 1),
-        "ns_by_pass": passes(simulation, min(50, steps)),
-        "vectorized": method.native,
-        "list": method.list_report(),
-        "seconds_to_place": round(placed, 1),
-        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
-        "error": overlap,
-        "error_kind": "largest overlap, radii",
-    }
-    simulation.close()
-    return row
+        for cell in cells:
+            cell.run()
+    for cell in cells:
+        row = cell.row()
+        if len(cells) == 1:
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            row |= {"peak_memory_gb": round(peak / 2**20, 3)}
+        if cell is not cells[0]:
+            ratios = np.asarray(cells[0].whole) / np.asarray(cell.whole)
+            row |= {
+                "speedup": round(float(np.median(cells[0].whole) / np.median(cell.whole)), 3),
+                "speedup_of_least": round(min(cells[0].whole) / min(cell.whole), 3),
+                "speedup_spread": [round(float(ratios.min()), 3), round(float(ratios.max()), 3)],
+            }
+        yield row
+        cell.simulation.close()
+
+
+class Cell:
+    """A simulation whose steps are timed."""
+
+    def __init__(
+        self, scene: wf.Scene, args: argparse.Namespace, workers: int, placement: Placement | None
+    ) -> None:
+        begin = time.perf_counter()
+        self.scene = scene
+        self.simulation = wf.Simulation(
+            scene, device=args.device, workers=workers, placement=placement
+        )
+        self.placed = time.perf_counter() - begin
+        self.count = self.simulation.model.segment_count
+        # of several lists, in cells of all sizes
+        self.steps = max(20, min(100, 100_000_000 // self.count))
+        self.simulation.step(200)  # skins of all sizes have settled
+        self.whole: list[float] = []  # ns per segment-step of every run
+        self.lists: list[float] = []
+        self.before = self._list_work()
+
+    def _list_work(self) -> np.ndarray:
+        """Builds, prunes beside them, seconds of pruning."""
+        search = self.simulation.method.search
+        return np.asarray([search.list.build_count, search.prune_count, search.prune_seconds])
+
+    def run(self) -> None:
+        """One timed run."""
+        seconds, building = timed_steps(self.simulation, self.steps)
+        self.whole.append(seconds / self.steps / self.count * 1e9)
+        self.lists.append(building / self.steps / self.count * 1e9)
+
+    def row(self) -> dict[str, Any]:
+        """What was measured."""
+        simulation, whole, steps = self.simulation, self.whole, self.steps
+        builds, prunes, pruning = self._list_work() - self.before
+        pruning *= 1e9 / self.count
+        median = float(np.median(whole))
+        return common(simulation) | {
+            "strain_per_step": round(simulation.dt * self.scene.flow.rate, 6),
+            "ns_per_segment_step": round(median, 1),
+            "ns_spread": [round(min(whole), 1), round(max(whole), 1)],
+            "us_per_step": round(median * self.count * 1e-3, 1),
+            "ns_list": round(float(np.mean(self.lists)), 1),
+            "ns_per_build": round((sum(self.lists) * steps - pruning) / max(1, builds), 1),
+            "ns_per_pruning": round(pruning / max(1, prunes), 1),
+            "ns_by_pass": passes(simulation, min(50, steps)),
+            "vectorized": simulation.method.native,
+            "list": simulation.method.list_report(),
+            "seconds_to_place": round(self.placed, 1),
+            "error": simulation.measure()["overlap_max"],
+            "error_kind": "largest overlap, radii",
+        }
 
 
 def accuracy(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -316,12 +360,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400, help="of one repeat of `dem`")
     parser.add_argument("--load", action="store_true", help="`dem`: the whole loading")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1])
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--set", action="append", default=[], type=_override)
     parser.add_argument("--shuffled", action="store_true", help="number large cells at random")
     parser.add_argument("--dry", action="store_true", help="print only")
     args = parser.parse_intermixed_args()
+    args.worker_counts, args.workers = args.workers, args.workers[0]
     for row in globals()[args.bench](args):
         line = json.dumps(row)
         print(line, flush=True)

@@ -19,11 +19,10 @@ from tests.physics.test_contact_hand_over import test_sticking_over_a_node as st
 from warpfiber.methods import bonded_spheres
 from warpfiber.methods.bonded_launches import bond_launch, drift_launch, pair_launches
 from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
-from warpfiber.passes import native_bonds, native_bonds_source, native_capsules_source
+from warpfiber.passes import native_bonds, native_bonds_source
 from warpfiber.passes.executor import Launch, load_kernels
 from warpfiber.passes.native_bonds import make_native_bond_sweep
 from warpfiber.passes.native_bonds_source import BEGIN, END, FROM_NODES, LOADS, TO_NODES
-from warpfiber.passes.native_capsules import make_native_capsule_pairs
 from warpfiber.simulation import Simulation
 
 BOUND = {"float64": 1e-13, "float32": 256 * np.finfo(np.float32).eps}
@@ -318,16 +317,13 @@ def test_where_it_applies() -> None:
 def test_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """What large beds fetch ahead changes no bit, nor is anything read behind the ends."""
     found = []
-    for large in (native_capsules_source.LARGE, 0):
-        for source in (native_capsules_source, native_bonds_source):
-            monkeypatch.setattr(source, "LARGE", large)
-        for factory in (make_native_bond_sweep, make_native_capsule_pairs):
-            factory.cache_clear()
+    for large in (native_bonds_source.LARGE, 0):
+        monkeypatch.setattr(native_bonds_source, "LARGE", large)
+        make_native_bond_sweep.cache_clear()
         sim = crowd()
         sim.step(40)
         assert sim.method.contacts.acts.numpy().any()  # type: ignore[attr-defined]
         found.append((sim.node_pos, sim.method.node_turn.numpy()))  # type: ignore[attr-defined]
     for small, big in zip(*found, strict=True):
         np.testing.assert_array_equal(big, small)
-    for factory in (make_native_bond_sweep, make_native_capsule_pairs):
-        factory.cache_clear()
+    make_native_bond_sweep.cache_clear()

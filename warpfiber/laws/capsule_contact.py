@@ -5,7 +5,7 @@ Source: F = 4/3 E* f delta^1.5, f = sqrt(R*) F_2^-1.5 with the correction F_2 = 
     sqrt(S^2 - 4 P), with S and P the sum and the product of the two principal relative curvatures:
     hemispheres, hemisphere on cylinder, cylinders at the angle alpha. What of a patch two segments
     share: `capsule_patch`.
-Symbols: r radius, k = 1 / r, E* = 1 / (e_a + e_b), e = (1 - nu^2) / E_c, delta overlap.
+Symbols: r radius, m = r_a r_b, E* = 1 / (e_a + e_b), e = (1 - nu^2) / E_c, delta overlap.
 Limits: sin(alpha) is to be 0.02 at least, where the patch of parallel cylinders would be endless.
 """
 
@@ -24,27 +24,27 @@ def make_capsule_contact(name):
     """`curvatures` and `hertz_factor`."""
     p = precision(name)
     real, vec2 = p.real, p.vec2
-    zero, one, two, quarter = real(0.0), real(1.0), real(2.0), real(0.25)
+    zero, one, two, four, quarter = (real(x) for x in (0.0, 1.0, 2.0, 4.0, 0.25))
     slender, power, steep = real(SLENDER), real(POWER), real(1.5 * SLENDER * POWER)
 
     @wp.func
-    def curvatures(ends: wp.int32, ka: real, kb: real, sine: real) -> vec2:
-        """(S, P); ends: 0 cylinders, 1 the end of a on b, 2 the end of b on a, 3 two ends."""
-        total = ka + kb
+    def curvatures(ends: wp.int32, ra: real, rb: real, sine: real) -> vec2:
+        """(m S, m^2 P); ends: 0 cylinders, 1 the end of a on b, 2 the end of b on a, 3 two ends."""
+        total = ra + rb
         if ends == 0:
-            return vec2(total, ka * kb * sine * sine)
+            return vec2(total, ra * rb * sine * sine)
         if ends == 1:
-            return vec2(ka + total, ka * total)
+            return vec2(rb + total, rb * total)
         if ends == 2:
-            return vec2(kb + total, kb * total)
+            return vec2(ra + total, ra * total)
         return vec2(two * total, total * total)
 
     @wp.func
-    def hertz_factor(sp: vec2) -> vec2:
+    def hertz_factor(sp: vec2, m: real) -> vec2:
         """f = sqrt(R*) F_2^-1.5, and d ln f / d ln P."""
-        difference = wp.sqrt(wp.max(sp[0] * sp[0] - real(4.0) * sp[1], zero))
+        difference = wp.sqrt(wp.max(sp[0] * sp[0] - four * sp[1], zero))
         # (S + D) / (S - D) without the difference of numbers that are nearly equal
-        ratio = (sp[0] + difference) * (sp[0] + difference) / (real(4.0) * sp[1])
+        ratio = (sp[0] + difference) * (sp[0] + difference) / (four * sp[1])
         slope = wp.pow(ratio, slender) - one
         correction = one
         steepness = -quarter
@@ -52,8 +52,9 @@ def make_capsule_contact(name):
             lacking = wp.pow(slope, power)
             correction = one - lacking
             # d ln rho / d ln P = -S / D
-            steepness -= steep * lacking / (slope * correction) * (one + slope) * sp[0] / difference
-        factor = one / (wp.sqrt(wp.sqrt(sp[1])) * correction * wp.sqrt(correction))
-        return vec2(factor, steepness)
+            more = lacking * (one + slope) * sp[0] / (slope * correction * difference)
+            steepness -= steep * more
+        cube = correction * correction * correction
+        return vec2(wp.sqrt(m / (wp.sqrt(sp[1]) * cube)), steepness)
 
     return curvatures, hertz_factor

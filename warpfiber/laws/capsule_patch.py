@@ -21,12 +21,10 @@ Limits: sin(angle) is taken as 0.02 at least, where c = 1.17 instead of 1 of par
     stand for bent fibers to that order.
 """
 
-import math
 from functools import cache
 
 import warp as wp
 
-from warpfiber.laws.capsule_contact import SMALLEST_SINE, make_capsule_contact
 from warpfiber.model import precision
 
 # Below this angle all slices are equally deep, to rounding.
@@ -40,229 +38,201 @@ BOTH_WAYS = 0.5  # cosine below which slices lie across both mean directions
 
 
 @cache
-def patch_share_struct(name):
-    """Energy of a share with its gradient, and where it acts."""
-    p = precision(name)
-
-    @wp.struct
-    class PatchShare:
-        energy: p.real
-        stiffness: p.real
-        damped: p.real  # stiffness that dashpots feel
-        s: p.real
-        t: p.real
-        depth: p.real  # the same for neighbors that share a patch
-        by_delta: p.vec3
-        by_a: p.vec3
-        by_b: p.vec3
-
-    return PatchShare
-
-
-@cache
 def make_capsule_patch(name):
-    """`side_share` of two segments, `tip_share` of a point and a segment."""
+    """`side_share` of two segments, `tip_share` of a point and a segment.
+
+    Both return energy, stiffness, stiffness that dashpots feel, where they act (lengths along the
+    segments), depth, and the energy's gradient by delta and by the segments.
+    """
     p = precision(name)
-    real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
-    PatchShare = patch_share_struct(name)
-    curvatures, hertz_factor = make_capsule_contact(name)
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     zero, half, one, two, four = (real(x) for x in (0.0, 0.5, 1.0, 2.0, 4.0))
-    power, tiny, least = real(2.5), real(1.0e-30), real(SMALLEST_SINE)
-    turning, further = real(TURNING_SINE), real(0.5 * BEYOND)
+    third, fifth, power = real(1.0 / 3.0), real(0.2), real(2.5)
+    tiny = real(1.0e-30)
+    further = real(0.5 * BEYOND)
     near, parallel2 = real(PARALLEL[name]), real(PARALLEL[name] ** 2)
-    outermost, inner, outer = real(math.sqrt(0.6)), real(4.0 / 9.0), real(5.0 / 18.0)
 
     @wp.func
-    def overlap_at(q: real, slope: real, vv: real, x: real) -> real:
-        """B^2 - D^2 a way x from where it is q."""
-        return q - (two * slope + vv * x) * x
+    def overlap_at(q: real, slope: real, ww: real, x: real) -> real:
+        """o = b^2 - D^2 a way x from where it is q."""
+        return q - (two * slope + ww * x) * x
 
     @wp.func
-    def slices(q: real, slope: real, vv: real, u_h: real, u1: real, u2: real) -> vec4:
-        """Integrals of o^2, o, o u, o u^2 with o of `overlap_at`: three Gauss points are exact."""
-        total = vec4()
-        for k in range(3):
-            u = half * (u1 + u2) + real(k - 1) * outermost * half * (u2 - u1)
-            o = overlap_at(q, slope, vv, u - u_h)
-            g = (u2 - u1) * wp.where(k == 1, inner, outer) * o
-            total += vec4(g * o, g, g * u, g * u * u)
-        return total
+    def slices(q: real, slope: real, ww: real, x1: real, x2: real) -> vec4:
+        """Integrals of o^2, o, o x, o x^2 from x1 to x2, by the expansion of o about the middle."""
+        x = half * (x1 + x2)
+        r = half * (x2 - x1)
+        o0 = overlap_at(q, slope, ww, x)
+        o1 = -two * r * (slope + ww * x)
+        o2 = -ww * r * r
+        square = o0 * o0 + third * (o1 * o1 + two * o0 * o2) + fifth * o2 * o2
+        whole = o0 + third * o2
+        first = third * o1
+        second = third * o0 + fifth * o2
+        width = two * r
+        return width * vec4(
+            square,
+            whole,
+            x * whole + r * first,
+            x * (x * whole + two * r * first) + r * r * second,
+        )
 
     @wp.func
-    def overlapping(q: real, slope: real, vv: real) -> vec2:
-        """How far from u_h slices overlap, without differences of numbers that are nearly equal."""
-        root = wp.sqrt(slope * slope + vv * q)
-        return vec2(-q / wp.max(root - slope, tiny), q / wp.max(root + slope, tiny))
-
-    @wp.func
-    def touched_part(u1: real, u2: real, reached: vec2, length: real) -> real:
-        """Of the patch, or of the segment if that is shorter."""
-        return (u2 - u1) / wp.min(reached[1] - reached[0], length)
-
-    @wp.func
-    def beyond_zero(x: real) -> real:
+    def beyond_zero(x: real, rounding: real) -> real:
         """1 beyond, 0 before; half where ends face each other and rounding would decide."""
-        return wp.where(x > near, one, wp.where(x < -near, zero, half))
+        return wp.where(x > rounding, one, wp.where(x < -rounding, zero, half))
 
     @wp.func
     def side_share(
         delta: vec3,
-        a: vec3,
-        b: vec3,
+        along_a: vec3,
+        along_b: vec3,
+        la: real,
+        lb: real,
+        by_la: real,
+        by_lb: real,
         reach: real,
-        modulus: real,
-        ki: real,
-        kj: real,
-        sigma: real,
-        weight: real,
-        weight_slope: real,
-    ) -> PatchShare:
-        """Of slices across the mean direction of a and sigma b; weight_slope: dw / d cosine."""
-        share = PatchShare()
-        la = wp.length(a)
-        lb = wp.length(b)
-        along_a = a / la
-        along_b = (sigma / lb) * b
-        cosine = wp.min(wp.dot(along_a, along_b), one)
-        twice = wp.sqrt(two * (one + cosine))
-        middle = (along_a + along_b) / twice
-        bm = wp.dot(b, middle)
-        t0 = -wp.dot(delta, middle) / bm
-        ratio = sigma * la / lb
-        d0 = delta + t0 * b
-        dv = ratio * b - a
-        # parts of a beside the ends of b
-        begin = -t0 / ratio
-        end = (one - t0) / ratio
-        first = wp.min(begin, end)
-        last = wp.max(begin, end)
-        low = wp.max(zero, first)
-        high = wp.min(one, last)
-        if high <= low:
-            return share
-        vv = wp.dot(dv, dv)
-        dd = wp.dot(d0, dv)
-        deepest = half * (low + high)
-        if vv > parallel2 * la * la:
-            deepest = -dd / vv
-        beyond = further * (one + lb / la)
-        ahead = wp.min(zero, first) - beyond
-        behind = wp.max(one, last) + beyond
-        u_h = wp.clamp(deepest, ahead, behind)
-        nearest = d0 + u_h * dv
-        h = wp.length(nearest)
-        if h >= reach:
-            return share
-        n = nearest / h
-        q = (reach - h) * (reach + h)
-        slope = wp.dot(nearest, dv)
-        reached = overlapping(q, slope, vv)
-        u1 = wp.max(low, u_h + reached[0])
-        u2 = wp.min(high, u_h + reached[1])
-        if u2 - u1 <= near:  # ends that face each other share nothing yet
-            return share
-        sums = slices(q, slope, vv, u_h, u1, u2)
-        cross = wp.length(wp.cross(along_a, along_b))
-        sine = wp.max(cross, least)
-        form = hertz_factor(curvatures(0, ki, kj, sine))
-        wide = reach + h
-        # y = 2 tan(angle / 2) times the way along m
-        rigid = weight * modulus * form[0] * (two * sine / twice) * la
-        scale = half * rigid / (wide * wide * wp.sqrt(wide))
-        energy = scale * sums[0]
-        share.energy = energy
-        share.stiffness = rigid * (u2 - u1) / wp.sqrt(wide)
-        share.damped = share.stiffness * touched_part(u1, u2, reached, half * (one + lb / la))
-        share.s = sums[2] / wp.max(sums[1], tiny)
-        share.t = t0 + share.s * ratio
-        share.depth = reach - h
+        rigidity: real,
+        steepness: real,
+        cosine: real,
+        wider: real,
+        by_ww: real,
+        leading: real,
+        forward: wp.bool,
+    ):
+        """Of slices across e; forward: sigma = 1; rigidity = w E* f sine.
 
-        # dE at fixed u, by t_0 and by the ratio of lengths
+        by_la = 1 / la; by_lb = sigma / lb; steepness = -d ln (f sine) / d cosine / cosine; wider =
+        1 / (1 + cosine); by_ww = 1 / w^2; leading = d ln w / d cosine.
+        """
+        nothing = vec3(zero, zero, zero)
+        e = along_a + along_b
+        w = along_b - along_a
+        offset = -wp.dot(delta, e) * wider
+        d0 = delta + offset * along_b
+        # where b begins and ends along a
+        first = wp.where(forward, -offset, -offset - lb)
+        last = first + lb
+        low = wp.max(zero, first)
+        high = wp.min(la, last)
+        if high <= low:
+            return zero, zero, zero, zero, zero, zero, nothing, nothing, nothing
+        ww = wp.max(wp.dot(w, w), parallel2)
+        deepest = wp.where(ww > parallel2, -wp.dot(d0, w) * by_ww, half * (low + high))
+        beyond = further * (la + lb)
+        ahead = wp.min(zero, first) - beyond
+        behind = wp.max(la, last) + beyond
+        u_h = wp.min(wp.max(deepest, ahead), behind)
+        nearest = d0 + u_h * w
+        hh = wp.dot(nearest, nearest)
+        if hh >= reach * reach:
+            return zero, zero, zero, zero, zero, zero, nothing, nothing, nothing
+        h = wp.sqrt(hh)
+        wide = reach + h
+        q = (reach - h) * wide
+        slope = wp.dot(nearest, w)
+        # where slices overlap; along parallel segments far beyond both
+        root = wp.sqrt(slope * slope + ww * q)
+        begin = low - u_h
+        end = high - u_h
+        x1 = wp.max(begin, -(root + slope) * by_ww)
+        x2 = wp.min(end, (root - slope) * by_ww)
+        if x2 - x1 <= near * la:  # ends that face each other share nothing yet
+            return zero, zero, zero, zero, zero, zero, nothing, nothing, nothing
+        sums = slices(q, slope, ww, x1, x2)
+        by_h = one / (h * wide)
+        by_wide = by_h * h
+        by_root = wp.sqrt(by_wide)
+        # y = 2 tan(angle / 2) times the way along the mean direction
+        rigid = rigidity * wp.sqrt(two * wider)
+        scale = half * rigid * by_wide * by_wide * by_root
+        energy = scale * sums[0]
+        stiffness = rigid * (x2 - x1) * by_root
+        whole_patch = wp.min(two * root * by_ww, half * (la + lb))
+        parts = one / wp.max(whole_patch * sums[1], tiny)
+        damped = stiffness * (x2 - x1) * (parts * sums[1])
+        place = u_h + sums[2] * (parts * whole_patch)
+
+        # dE by D, at U = 0 and times U; by h; by the ends of a and b
         pull = -four * scale
-        whole = pull * (sums[1] * d0 + sums[2] * dv)
-        moment = pull * (sums[2] * d0 + sums[3] * dv)
-        by_h = (-power * energy / wide) * n
-        g_delta = whole + by_h
-        g_a = -moment - u_h * by_h
-        g_b = t0 * whole + ratio * moment + (t0 + u_h * ratio) * by_h
-        g_t0 = wp.dot(g_delta, b)
-        g_ratio = wp.dot(moment + u_h * by_h, b)
-        # ends of b move along a
-        moved = zero
-        moved_part = zero
-        stretched = zero
-        if u2 >= high:
-            o = overlap_at(q, slope, vv, u2 - u_h)
-            cut = beyond_zero(one - last) * scale * o * o
-            moved += cut
-            moved_part += cut * u2
-        if u1 <= low:
-            o = overlap_at(q, slope, vv, u1 - u_h)
-            cut = beyond_zero(first) * scale * o * o
-            moved -= cut
-            moved_part -= cut * u1
-        held = wp.dot(by_h, dv)
-        if deepest < ahead:
-            stretched += further * held
-            moved += beyond_zero(-first) * held
-            moved_part += beyond_zero(-first) * held * first
-        if deepest > behind:
-            stretched -= further * held
-            moved += beyond_zero(last - one) * held
-            moved_part += beyond_zero(last - one) * held * last
-        g_ratio += stretched * sigma / (ratio * ratio)
-        g_t0 -= moved / ratio
-        g_ratio -= moved_part / ratio
+        deeper = (-power * energy * by_h) * nearest
+        whole = (pull * sums[1]) * nearest + (pull * sums[2]) * w + deeper
+        moment = (pull * sums[2]) * nearest + (pull * sums[3]) * w + u_h * whole
+        o = overlap_at(q, slope, ww, x2)
+        at_high = wp.where(x2 >= end, scale * o * o, zero)
+        at_last = beyond_zero(la - last, near * la) * at_high
+        o = overlap_at(q, slope, ww, x1)
+        at_first = wp.where(x1 <= begin, scale * o * o, zero)
+        at_first *= -beyond_zero(first, near * la)
+        by_length_a = at_high - at_last
+        held = wp.dot(deeper, w)
+        # where the deepest slice is beyond both
+        is_ahead = deepest < ahead
+        is_behind = deepest > behind
+        at_first += wp.where(is_ahead, beyond_zero(-first, near * la) * held, zero)
+        ends = beyond_zero(last - la, near * la)
+        at_last += wp.where(is_behind, ends * held, zero)
+        by_length_a += wp.where(is_behind, (one - ends) * held, zero)
+        stretched = wp.where(is_behind, further, wp.where(is_ahead, -further, zero)) * held
+        by_length_a += stretched
+        by_length_b = stretched + wp.where(forward, at_last, -at_first)
         # angle: f, w and the way across
-        g_cosine = weight_slope / weight - half / (one + cosine)
-        if cross > turning:
-            g_cosine -= (two * form[1] + one) * cosine / (sine * sine)
-        g_cosine *= energy
-        g_a += (energy / la + g_ratio * sigma / lb) * along_a
-        g_a += (g_cosine / la) * (along_b - cosine * along_a)
-        g_b -= (g_ratio * ratio / (lb * lb)) * b
-        g_b += (g_cosine * sigma / lb) * (along_a - cosine * along_b)
-        # slices turn with m
-        g_t0 /= -bm
-        g_delta += g_t0 * middle
-        g_b += (g_t0 * t0) * middle
-        turned = (g_t0 / twice) * d0
-        g_a += (turned - wp.dot(turned, along_a) * along_a) / la
-        g_b += (sigma / lb) * (turned - wp.dot(turned, along_b) * along_b)
-        share.by_delta = g_delta
-        share.by_a = g_a
-        share.by_b = g_b
-        return share
+        by_cosine = energy * (leading - half * wider - steepness * cosine)
+        # slices turn with the mean direction: d0 stays across e
+        turn = -wider * (wp.dot(whole, along_b) - at_first - at_last)
+        by_delta = whole + turn * e
+        turned = turn * d0
+        g_a = turned - moment + by_cosine * along_b
+        g_b = turned + moment + by_cosine * along_a + offset * by_delta
+        return (
+            energy,
+            stiffness,
+            damped,
+            place,
+            offset + place,
+            reach - h,
+            by_delta,
+            by_la * g_a + (by_length_a - by_la * wp.dot(g_a, along_a)) * along_a,
+            by_lb * g_b
+            + (wp.where(forward, by_length_b, -by_length_b) - by_lb * wp.dot(g_b, along_b))
+            * along_b,
+        )
 
     @wp.func
-    def tip_share(delta: vec3, b: vec3, reach: real, rigidity: real) -> PatchShare:
-        """Of a tip and the segment b that begins at delta from it; rigidity = E* f."""
-        share = PatchShare()
-        bb = wp.dot(b, b)
-        t_h = wp.clamp(-wp.dot(delta, b) / bb, zero, one)
-        nearest = delta + t_h * b
-        h = wp.length(nearest)
-        if h >= reach:
-            return share
-        q = (reach - h) * (reach + h)
-        slope = wp.dot(nearest, b)
-        reached = overlapping(q, slope, bb)
-        t1 = wp.max(zero, t_h + reached[0])
-        t2 = wp.min(one, t_h + reached[1])
-        sums = slices(q, slope, bb, t_h, t1, t2)
+    def tip_share(delta: vec3, along: vec3, length: real, reach: real, rigidity: real):
+        """Of a tip and a segment that begins at delta from it; rigidity = E* f."""
+        nothing = vec3(zero, zero, zero)
+        t_h = wp.min(wp.max(-wp.dot(delta, along), zero), length)
+        nearest = delta + t_h * along
+        hh = wp.dot(nearest, nearest)
+        if hh >= reach * reach:
+            return zero, zero, zero, zero, zero, nothing, nothing
+        h = wp.sqrt(hh)
         wide = reach + h
-        rigid = rigidity * wp.sqrt(bb)
-        scale = half * rigid / (wide * wide * wp.sqrt(wide))
+        q = (reach - h) * wide
+        slope = wp.dot(nearest, along)
+        root = wp.sqrt(slope * slope + q)
+        x1 = wp.max(-t_h, -root - slope)
+        x2 = wp.min(length - t_h, root - slope)
+        sums = slices(q, slope, one, x1, x2)
+        by_h = one / (h * wide)
+        by_wide = by_h * h
+        by_root = wp.sqrt(by_wide)
+        scale = half * rigidity * by_wide * by_wide * by_root
         energy = scale * sums[0]
-        share.energy = energy
-        share.stiffness = rigid * (t2 - t1) / wp.sqrt(wide)
-        share.damped = share.stiffness * touched_part(t1, t2, reached, one)
-        share.t = sums[2] / wp.max(sums[1], tiny)
-        share.depth = reach - h
-        by_h = (-power * energy / (wide * h)) * nearest
+        stiffness = rigidity * (x2 - x1) * by_root
+        damped = stiffness * (x2 - x1) / wp.min(two * root, length)
         pull = -four * scale
-        share.by_delta = pull * (sums[1] * delta + sums[2] * b) + by_h
-        share.by_b = pull * (sums[2] * delta + sums[3] * b) + t_h * by_h + (energy / bb) * b
-        return share
+        by_delta = (pull * sums[1] - power * energy * by_h) * nearest + (pull * sums[2]) * along
+        moment = (pull * sums[2]) * nearest + (pull * sums[3]) * along + t_h * by_delta
+        return (
+            energy,
+            stiffness,
+            damped,
+            t_h + sums[2] / wp.max(sums[1], tiny),
+            reach - h,
+            by_delta,
+            (one / length) * (moment + energy * along),
+        )
 
     return side_share, tip_share

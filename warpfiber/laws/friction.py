@@ -17,6 +17,8 @@ import warp as wp
 
 from warpfiber.model import precision
 
+SMALLEST = {"float32": 1e-36, "float64": 1e-300}  # what a product of squares is at least
+
 
 @cache
 def make_friction(name):
@@ -24,20 +26,17 @@ def make_friction(name):
     p = precision(name)
     real, vec3 = p.real, p.vec3
     zero = real(0.0)
-    tiny = real(1.0e-30)
+    tiny, smallest = real(1.0e-30), real(SMALLEST[name])
 
     @wp.func
     def carried_memory(h: vec3, d_before: real, d: real, n: vec3, turn: real) -> vec3:
         """h in the present plane, turned by `turn` (rad, small) about n; 0 without d_before."""
         if d_before <= zero:
             return vec3(zero, zero, zero)
-        size = wp.length(h)
         flat = h - wp.dot(h, n) * n
         flat += turn * wp.cross(n, flat)
-        flat = (size / wp.max(wp.length(flat), tiny)) * flat
-        if d > d_before:
-            flat *= wp.sqrt(d_before / d)
-        return flat
+        kept = wp.dot(h, h) * wp.min(d_before, d)
+        return wp.sqrt(kept / wp.max(wp.dot(flat, flat) * d, smallest)) * flat
 
     @wp.func
     def friction_force(h: vec3, k: real, damping: real, v: vec3, limit: real):

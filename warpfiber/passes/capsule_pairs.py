@@ -15,7 +15,7 @@ import warp as wp
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, PAIR_COUNT, precision
-from warpfiber.passes.array_items import make_items
+from warpfiber.passes.array_items import make_fetch, make_items
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_hits import part_begin
@@ -48,6 +48,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     _, set_four = make_items(vec4)
     _, set_nine = make_items(mat33)
     _, set_flag = make_items(wp.uint8)
+    fetch_place, fetch_vector = make_fetch(wp.vec3d), make_fetch(vec3)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -82,7 +83,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 first = g.end_mass
             if at == g.segments - 1:
                 second = g.end_mass
-        return (one - s) * (one - s) / first + s * s / second
+        return ((one - s) * (one - s) * second + s * s * first) / (first * second)
 
     @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def capsule_pairs(
@@ -122,7 +123,15 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             return
         part = wp.tid() + offset
         begin = part_begin(part, parts, status[wp.static(PAIR_COUNT)])
-        for hit in range(begin, begin + hit_count[part]):
+        end = begin + hit_count[part]
+        for hit in range(begin, end):
+            # nodes of partners lie anywhere
+            k = number(hit_pair, wp.min(hit + 2, end - 1))
+            node_j = number(segment_node, number(pair_j, k))
+            fetch_place(place, node_j)
+            if wp.static(has_dashpot or has_friction):
+                fetch_vector(node_velocity, node_j)
+                fetch_vector(node_spin, node_j)
             k = number(hit_pair, hit)
             st = pair_of(hit_closest, hit)
             i = number(pair_i, k)
@@ -146,17 +155,16 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             reach = gi.radius + gj.radius
             if wp.length_sq(c) >= reach * reach:
                 continue
-            push, felt, springs = normal_contact(gi, gj, at_i, at_j, delta, a, b, st)
+            push, felt, n, springs, on_i, on_j = normal_contact(
+                gi, gj, at_i, at_j, delta, a, b, st, c
+            )
             if felt[2] <= zero:
                 continue
             depth = felt[0]
             s = push[2]
             t = push[3]
-            c = delta + t * b - s * a
-            distance = wp.length(c)
-            n = c / distance
-            arm_i = half * (distance + gi.radius - gj.radius)
-            arm_j = distance - arm_i
+            arm_i = half * (felt[3] + gi.radius - gj.radius)
+            arm_j = felt[3] - arm_i
             size = push[0]
             force = vec3(zero, zero, zero)
             if wp.static(has_dashpot or has_friction):
@@ -203,10 +211,10 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now
             set_flag(pair_acts, k, wp.uint8(1))
-            set_vector(pair_force_out, k, force - (size - push[0]) * n + springs[0])
+            set_vector(pair_force_out, k, force - (size - push[0]) * n + springs)
             set_number(pair_hit_out, k, hit)
             set_vector(hit_moment_out, hit, wp.cross(n, force))
-            set_nine(hit_beside_out, hit, wp.matrix_from_rows(springs[1], -springs[1], springs[2]))
+            set_nine(hit_beside_out, hit, wp.matrix_from_rows(on_i, -on_i, on_j))
             set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
 
     return capsule_pairs

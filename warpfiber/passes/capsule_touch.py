@@ -13,9 +13,9 @@ import warp as wp
 from warpfiber.laws.capsule_contact import SMALLEST_SINE, make_capsule_contact
 from warpfiber.laws.capsule_patch import (
     BOTH_WAYS,
+    PARALLEL,
     TURNING_SINE,
     make_capsule_patch,
-    patch_share_struct,
 )
 from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
@@ -27,115 +27,29 @@ from warpfiber.passes.ring_nodes import make_ring_nodes
 def make_capsule_touch(name: str, closed: bool = False):
     """`normal_contact`: what springs of a pair do; nothing without energy.
 
-    (part along the normal, stiffness, s, t), (depth for memories, stiffness for dashpots, energy),
-    and rows: the force on i at s, its reverse on j at t; what the first node of i feels besides,
-    its reverse the second one; the same of j.
+    (part along the normal, stiffness, s, t), (depth for memories, stiffness for dashpots, energy,
+    distance at s and t), the normal there, the force on i at s, its reverse on j at t; what the
+    first node of i feels besides, its reverse the second one; the same of j.
     """
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
-    PatchShare = patch_share_struct(name)
     has_before, has_after, _, _, _, _ = make_ring_nodes(closed)
     curvatures, hertz_factor = make_capsule_contact(name)
     side_share, tip_share = make_capsule_patch(name)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     near, least_sine, both_ways = real(END_TOLERANCE[name]), real(SMALLEST_SINE), real(BOTH_WAYS)
     turning, tiny = real(TURNING_SINE), real(1.0e-30)
+    parallel2 = real(PARALLEL[name] ** 2)
     two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
 
     @wp.func
-    def point_share(
-        delta: vec3, a: vec3, b: vec3, s: real, t: real, depth: real, stiffness: real
-    ) -> PatchShare:
-        """Hertz at s and t, with the stiffness there."""
-        c = delta + t * b - s * a
-        share = PatchShare()
-        share.stiffness = stiffness
-        share.damped = stiffness
-        share.energy = two_fifths * two_thirds * stiffness * depth * depth
-        share.s = s
-        share.t = t
-        share.depth = depth
-        share.by_delta = (-two_thirds * stiffness * depth / wp.length(c)) * c
-        share.by_a = -s * share.by_delta
-        share.by_b = t * share.by_delta
-        return share
-
-    @wp.func
-    def larger(kept: PatchShare, other: PatchShare) -> PatchShare:
-        if other.energy > kept.energy:
-            return other
-        return kept
-
-    @wp.func
-    def shared_side(
-        delta: vec3, a: vec3, b: vec3, reach: real, modulus: real, ki: real, kj: real
-    ) -> PatchShare:
-        """Of slices across one mean direction or both."""
-        signed = wp.dot(a, b) / (wp.length(a) * wp.length(b))
-        cosine = wp.abs(signed)
-        sigma = wp.where(signed < zero, -one, one)
-        ways = wp.where(cosine >= both_ways, 1, 2)
-        share = PatchShare()
-        for way in range(ways):
-            weight = wp.where(ways == 1, one, half + cosine)
-            slope = wp.where(ways == 1, zero, one)
-            if way == 1:
-                weight = one - weight
-                sigma = -sigma
-            more = side_share(delta, a, b, reach, modulus, ki, kj, sigma, weight, slope)
-            energy = share.energy + more.energy
-            part = more.energy / wp.max(energy, tiny)
-            share.s += part * (more.s - share.s)
-            share.t += part * (more.t - share.t)
-            share.energy = energy
-            share.stiffness += more.stiffness
-            share.damped += more.damped
-            share.depth = wp.max(share.depth, more.depth)
-            share.by_delta += more.by_delta
-            share.by_a += more.by_a
-            share.by_b += more.by_b
-        return share
-
-    @wp.func
-    def tips(
-        kept: PatchShare,
-        is_tip_i: wp.bool,
-        is_tip_j: wp.bool,
-        s: real,
-        t: real,
-        delta: vec3,
-        a: vec3,
-        b: vec3,
-        reach: real,
-        modulus: real,
-        ki: real,
-        kj: real,
-    ) -> PatchShare:
-        """The largest of a share and of those of a tip of i at s, of j at t, and of both."""
-        share = kept
-        if is_tip_i:
-            form = hertz_factor(curvatures(1, ki, kj, one))
-            tip = tip_share(delta - s * a, b, reach, modulus * form[0])
-            tip.s = s
-            tip.by_a = -s * tip.by_delta
-            share = larger(share, tip)
-        if is_tip_j:
-            form = hertz_factor(curvatures(2, ki, kj, one))
-            tip = tip_share(-delta - t * b, a, reach, modulus * form[0])
-            tip.s = tip.t
-            tip.t = t
-            tip.by_a = tip.by_b
-            tip.by_b = -t * tip.by_delta
-            tip.by_delta = -tip.by_delta
-            share = larger(share, tip)
-        if is_tip_i and is_tip_j:
-            depth = reach - wp.length(delta + t * b - s * a)
-            if depth > zero:
-                form = hertz_factor(curvatures(3, ki, kj, one))
-                stiffness = two * modulus * form[0] * wp.sqrt(depth)
-                share = larger(share, point_share(delta, a, b, s, t, depth, stiffness))
-        return share
+    def is_tip(g: BondGroup, at: wp.int32, s: real) -> wp.bool:
+        """Whether the nearer end of a segment ends its fiber."""
+        ring = g.closed * (g.segments + 1)
+        if s < half:
+            return not has_before(at, ring)
+        return not has_after(at, g.segments, ring)
 
     @wp.func
     def normal_contact(
@@ -147,55 +61,182 @@ def make_capsule_touch(name: str, closed: bool = False):
         a: vec3,
         b: vec3,
         st: vec2,
+        gap: vec3,
     ):
-        """Of segments nearest at st and within reach there."""
+        """Of segments nearest at st, within reach there; gap from the point of i to that of j."""
         reach = gi.radius + gj.radius
         modulus = one / (gi.compliance + gj.compliance)
-        ki = one / gi.radius
-        kj = one / gj.radius
+        both_radii = gi.radius * gj.radius
         la = wp.length(a)
         lb = wp.length(b)
-        distance = wp.length(delta + st[1] * b - st[0] * a)
-        depth = wp.max(reach - distance, zero)
-        signed = wp.dot(a, b) / (la * lb)
-        # half of the patch along either fiber
-        patch = wp.sqrt(depth * (reach + distance) / (two * wp.max(one - wp.abs(signed), near)))
-        patch = wp.max(patch, near * wp.max(la, lb))
+        by_both = one / (la * lb)
+        by_la = lb * by_both
+        by_lb = la * by_both
+        along_a = by_la * a
+        along_b = by_lb * b
+        signed = wp.dot(along_a, along_b)
+        cosine = wp.min(wp.abs(signed), one)
+        cross = wp.length(wp.cross(along_a, along_b))
+        sine = wp.max(cross, least_sine)
+        by_sine2 = one / (sine * sine)
+        form = hertz_factor(curvatures(0, gi.radius, gj.radius, sine), both_radii)
+        rigidity = modulus * form[0]
         inside = wp.min(wp.min(st[0], one - st[0]) * la, wp.min(st[1], one - st[1]) * lb)
-        share = PatchShare()
-        if inside > patch:
-            sine = wp.max(wp.length(wp.cross(a, b)) / (la * lb), least_sine)
-            form = hertz_factor(curvatures(0, ki, kj, sine))
-            stiffness = two * modulus * form[0] * wp.sqrt(depth)
-            share = point_share(delta, a, b, st[0], st[1], depth, stiffness)
-            if sine > turning:
-                # a wider angle stores less: d ln P = -2 cos d cos / sin^2
-                twist = -two * form[1] * share.energy * signed / (sine * sine)
-                share.by_a += (twist / la) * (b / lb - (signed / la) * a)
-                share.by_b += (twist / lb) * (a / la - (signed / lb) * b)
-        else:
-            share = shared_side(delta, a, b, reach, modulus, ki, kj)
-            ring_i = gi.closed * (gi.segments + 1)
-            ring_j = gj.closed * (gj.segments + 1)
-            s = wp.where(st[0] < half, zero, one)
-            t = wp.where(st[1] < half, zero, one)
-            is_tip_i = not has_before(at_i, ring_i)
-            if s > zero:
-                is_tip_i = not has_after(at_i, gi.segments, ring_i)
-            is_tip_j = not has_before(at_j, ring_j)
-            if t > zero:
-                is_tip_j = not has_after(at_j, gj.segments, ring_j)
-            share = tips(share, is_tip_i, is_tip_j, s, t, delta, a, b, reach, modulus, ki, kj)
-        n = wp.normalize(delta + share.t * b - share.s * a)
-        size = wp.max(-wp.dot(share.by_delta, n), zero)
+        # half of the patch along either fiber is its root
+        patch2 = reach * reach - wp.dot(gap, gap)
+        inside2 = two * inside * inside * wp.max(one - cosine, near)
+        if inside2 > patch2 and inside > near * wp.max(la, lb):
+            distance = wp.length(gap)
+            depth = wp.max(reach - distance, zero)
+            stiffness = two * rigidity * wp.sqrt(depth)
+            size = two_thirds * stiffness * depth
+            energy = two_fifths * size * depth
+            # a wider angle stores less: d ln P = -2 cos d cos / sin^2
+            twist = wp.where(cross > turning, -two * form[1] * energy * signed * by_sine2, zero)
+            n = (one / distance) * gap
+            return (
+                vec4(size, stiffness, st[0], st[1]),
+                vec4(depth, stiffness, energy, distance),
+                n,
+                -size * n,
+                (twist * by_la) * (along_b - signed * along_a),
+                (twist * by_lb) * (along_a - signed * along_b),
+            )
+
+        energy = zero
+        stiffness = zero
+        damped = zero
+        s = zero
+        t = zero
+        deep = zero
+        by_delta = vec3(zero, zero, zero)
+        by_a = vec3(zero, zero, zero)
+        by_b = vec3(zero, zero, zero)
+        forward = signed >= zero
+        along = cosine
+        across_b = wp.where(forward, one, -one) * along_b
+        w = across_b - along_a
+        # 1 / (1 + cosine), 1 / w^2; slices the other way have e and w in each other's place
+        ww = wp.max(wp.dot(w, w), parallel2)
+        by_ends = one / ((one + cosine) * ww)
+        wider = by_ends * ww
+        by_ww = by_ends * (one + cosine)
+        steepness = wp.where(cross > turning, (two * form[1] + one) * by_sine2, zero)
+        rigidity *= sine
+        ways = wp.where(cosine >= both_ways, 1, 2)
+        weight = wp.where(ways == 1, one, half + cosine)
+        for way in range(ways):
+            sigma = wp.where(forward, one, -one)
+            leading = zero
+            if ways == 2:
+                leading = one / weight
+            e_more, k_more, d_more, s_more, t_more, deep_more, by_d, by_i, by_j = side_share(
+                delta,
+                along_a,
+                sigma * along_b,
+                la,
+                lb,
+                by_la,
+                sigma * by_lb,
+                reach,
+                weight * rigidity,
+                steepness,
+                along,
+                wider,
+                by_ww,
+                leading,
+                forward,
+            )
+            part = one
+            if way == 1:
+                part = e_more / wp.max(energy + e_more, tiny)
+            energy += e_more
+            s += part * (by_la * s_more - s)
+            t += part * (sigma * by_lb * t_more - t)
+            stiffness += k_more
+            damped += d_more
+            deep = wp.max(deep, deep_more)
+            by_delta += by_d
+            by_a += by_i
+            by_b += by_j
+            forward = not forward
+            along = -along
+            weight = wp.max(one - weight, tiny)
+            before = wider
+            wider = two * by_ww
+            by_ww = half * before
+
+        is_tip_i = is_tip(gi, at_i, st[0])
+        is_tip_j = is_tip(gj, at_j, st[1])
+        if is_tip_i or is_tip_j:
+            tip_s = wp.where(st[0] < half, zero, one)
+            tip_t = wp.where(st[1] < half, zero, one)
+            if is_tip_i:
+                round = (
+                    modulus * hertz_factor(curvatures(1, gi.radius, gj.radius, one), both_radii)[0]
+                )
+                start = delta - tip_s * a
+                e_tip, k_tip, d_tip, t_tip, deep_tip, by_d, by_j = tip_share(
+                    start, along_b, lb, reach, round
+                )
+                if e_tip > energy:
+                    energy = e_tip
+                    stiffness = k_tip
+                    damped = d_tip
+                    s = tip_s
+                    t = t_tip * by_lb
+                    deep = deep_tip
+                    by_delta = by_d
+                    by_a = -tip_s * by_d
+                    by_b = by_j
+            if is_tip_j:
+                round = (
+                    modulus * hertz_factor(curvatures(2, gi.radius, gj.radius, one), both_radii)[0]
+                )
+                start = -delta - tip_t * b
+                e_tip, k_tip, d_tip, s_tip, deep_tip, by_d, by_i = tip_share(
+                    start, along_a, la, reach, round
+                )
+                if e_tip > energy:
+                    energy = e_tip
+                    stiffness = k_tip
+                    damped = d_tip
+                    s = s_tip * by_la
+                    t = tip_t
+                    deep = deep_tip
+                    by_delta = -by_d
+                    by_a = by_i
+                    by_b = -tip_t * by_d
+            if is_tip_i and is_tip_j:
+                c = delta + tip_t * b - tip_s * a
+                apart = wp.length(c)
+                deep_tip = wp.max(reach - apart, zero)
+                round = (
+                    modulus * hertz_factor(curvatures(3, gi.radius, gj.radius, one), both_radii)[0]
+                )
+                k_tip = two * round * wp.sqrt(deep_tip)
+                push = two_thirds * k_tip * deep_tip
+                if two_fifths * push * deep_tip > energy:
+                    energy = two_fifths * push * deep_tip
+                    stiffness = k_tip
+                    damped = k_tip
+                    s = tip_s
+                    t = tip_t
+                    deep = deep_tip
+                    by_delta = (-push / apart) * c
+                    by_a = -tip_s * by_delta
+                    by_b = tip_t * by_delta
+
+        between = delta + t * b - s * a
+        apart = wp.length(between)
+        n = (one / apart) * between
         return (
-            vec4(size, share.stiffness, share.s, share.t),
-            vec3(share.depth, share.damped, share.energy),
-            wp.matrix_from_rows(
-                share.by_delta,
-                share.by_a + share.s * share.by_delta,
-                share.by_b - share.t * share.by_delta,
-            ),
+            vec4(wp.max(-wp.dot(by_delta, n), zero), stiffness, s, t),
+            vec4(deep, damped, energy, apart),
+            n,
+            by_delta,
+            by_a + s * by_delta,
+            by_b - t * by_delta,
         )
 
     return normal_contact

@@ -97,22 +97,24 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
             reach = gi.radius + gj.radius
-            if wp.length_sq(delta + st[1] * b - st[0] * a) >= reach * reach:
+            c = delta + st[1] * b - st[0] * a
+            if wp.length_sq(c) >= reach * reach:
                 continue
-            push, felt, springs = normal_contact(gi, gj, at_i, at_j, delta, a, b, st)
+            push, felt, n, springs, _on_i, _on_j = normal_contact(
+                gi, gj, at_i, at_j, delta, a, b, st, c
+            )
             if felt[2] <= zero:
                 continue
             if wp.static(is_step):
                 arms = pair_arms[k]
                 s = push[2]
                 t = push[3]
-                n = wp.normalize(delta + t * b - s * a)
                 slip = (one - s) * node_velocity[node_i] + s * node_velocity[end_i]
                 slip -= (one - t) * node_velocity[node_j] + t * node_velocity[end_j]
                 spin = arms[2] * ((one - s) * node_spin[node_i] + s * node_spin[end_i])
                 spin += arms[3] * ((one - t) * node_spin[node_j] + t * node_spin[end_j])
                 slip += wp.cross(spin, n)
-                force = pair_force[k] - springs[0]
+                force = pair_force[k] - springs
                 along = wp.dot(force, n) * wp.dot(slip, n)
                 normal -= wp.float64(along)
                 tangential -= wp.float64(wp.dot(force, slip) - along)

@@ -19,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfiber.passes.workers import Barrier, Workers, meet_kernel, wait_kernel
+from warpfiber.passes.workers import Barrier, Workers, crew_kernels, meet_kernel
 
 COMPILERS = min(os.cpu_count() or 1, 4)  # at a time; each takes some hundred MB
 BATCH = 16  # steps per graph where looking after every step would cost more than it saves
@@ -172,7 +172,7 @@ class Executor:
         self._pool: Workers | None = None
         self._apart: list[tuple[list[Any], Launch | Call | Repeat]] = []
         if self.workers > 1:
-            load_kernels([wait_kernel(), meet_kernel()], device)
+            load_kernels([*crew_kernels(), meet_kernel()], device)
             self._barrier = Barrier(self.workers)
             # all before the threads start: nothing may be launched during a capture
             sizes = [1] if single else [1, WORKER_BATCH]

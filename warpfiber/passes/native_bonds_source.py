@@ -15,9 +15,10 @@ from warpfiber.model import BAD_FIBER, EXPIRED, HALT, TORN
 from warpfiber.passes.bonds import CLAMPED, END_SPEED, FREE, LOWER, SETTLING, BondFeatures
 from warpfiber.passes.native import lane_types, transfers, transpose
 from warpfiber.passes.native_bond_law import BONDS, bond_constants
-from warpfiber.passes.native_capsules_source import LARGE, PARTS
+from warpfiber.passes.native_capsules_source import PARTS
 
 LANES = 8  # fibers, in both precisions
+LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
 FROM_NODES, TO_NODES = 8, 16

@@ -1,6 +1,8 @@
 """C++ text that collects near pairs of bonded spheres within reach for their law of contact.
 
-Pairs whose patch lies within both segments are collected apart: their law is shorter.
+Pairs are collected apart by what of the law they need: whether their patch lies within both
+segments, at the end of a fiber, or across which mean directions. What a step reads and writes is
+more than the second cache holds; it is fetched there, since asking for the first one stands still.
 Source: the patch of `capsule_touch`, with the largest reach of all pairs.
 """
 
@@ -8,12 +10,20 @@ Source: the patch of `capsule_touch`, with the largest reach of all pairs.
 SWEEP = """
     const int begin = out_start[part_start[part]], end = begin + near_count[part];
     if (keeps) __builtin_memset(pair_acts + begin, 0, out_start[part_start[part + 1]] - begin);
-    struct Whole { enum { IS_SHARED = false }; };
-    struct Shared { enum { IS_SHARED = true }; };
-    constexpr int ROOM = 2 * W;
-    // pairs that may have a part of a patch lie behind those that have a whole one
-    int hit_at[2 * ROOM], wholes = 0, parts = 0;
-    T hit_s[2 * ROOM], hit_t[2 * ROOM];
+    struct Whole {
+        enum { IS_SHARED = false, WAYS = 1, HAS_TIPS = false };
+        typedef Untipped Tips;
+    };
+    struct OneWay : Whole { enum { IS_SHARED = true }; };
+    struct TwoWays : OneWay { enum { WAYS = 2 }; };
+    struct AtTips : OneWay {
+        enum { WAYS = 0, HAS_TIPS = true };
+        typedef Tipped Tips;
+    };
+    auto fetch = [](const void* from) { __builtin_prefetch(from, 0, 2); };
+    constexpr int ROOM = 2 * W, KINDS = 4;
+    int hit_at[KINDS * ROOM], hits_of[KINDS] = {0, 0, 0, 0};
+    T hit_s[KINDS * ROOM], hit_t[KINDS * ROOM];
     auto run = [&](auto kind, int from, int& hits) {
         law(kind, hit_at + from, hit_s + from, hit_t + from, W);
         hits -= W;
@@ -39,12 +49,16 @@ SWEEP = """
         __builtin_memcpy(&code_j, near_j + first, sizeof(I));
         __builtin_memcpy(&images, near_image + first, sizeof(I));
         const I from_i = code_i >> TIP_BITS, from_j = code_j >> TIP_BITS;
-        const int* const later = near_j + first + (is_large ? AHEAD : 1) * W;
+        const int* const later = near_j + first + AHEAD * W;
         for (int l = 0; l < W; ++l) {
             const double* const x = (const double*)place + 3L * (later[l] >> TIP_BITS);
-            __builtin_prefetch(x);
-            if (is_large) __builtin_prefetch(x + 5);
+            fetch(x);
+            fetch(x + 5);
         }
+        fetch(near_i + first + FAR * W);
+        fetch(near_j + first + FAR * W);
+        fetch(near_image + first + FAR * W);
+        fetch(near_pair + first + FAR * W);
         V s, t, aa, bb, ab;
         const V3 c = closest(images, (const int*)&from_i, (const int*)&from_j, s, t, aa, bb, ab);
         const V square = c.dot(c), rest_s = T(1) - s, rest_t = T(1) - t;
@@ -54,33 +68,47 @@ SWEEP = """
         const V both = root(aa * bb), wide = T(2) * (both - (ab < T(0) ? -ab : ab));
         const V most = (largest_reach * largest_reach - square) * both;
         const M whole = (in_s * in_s * aa * wide > most) & (in_t * in_t * bb * wide > most);
-        const unsigned shared = bits(~whole);
+        const M at_tip = (s < T(0.5) ? tipped(code_i, 1) : tipped(code_i, 2))
+            | (t < T(0.5) ? tipped(code_j, 1) : tipped(code_j, 2));
+        const V size = ab < T(0) ? -ab : ab;
+        const unsigned shared = bits(~whole), tips = bits(at_tip);
+        const unsigned crossed = bits(size < BOTH_WAYS * both);
         for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
-            const int slot = shared >> l & 1 ? ROOM + parts++ : wholes++;
+            const int kind = !(shared >> l & 1) ? 0
+                : (tips >> l & 1 ? 3 : (crossed >> l & 1 ? 2 : 1));
+            const int slot = kind * ROOM + hits_of[kind]++;
             hit_at[slot] = first + l;
             hit_s[slot] = ((const T*)&s)[l];
             hit_t[slot] = ((const T*)&t)[l];
             const long k = near_pair[first + l];
             const long i = ((const int*)&from_i)[l], j = ((const int*)&from_j)[l];
             if constexpr (HAS_DASHPOT || HAS_FRICTION) {
-                __builtin_prefetch((const T*)node_velocity + 3 * i);
-                __builtin_prefetch((const T*)node_velocity + 3 * j);
-                __builtin_prefetch((const T*)node_spin + 3 * i);
-                __builtin_prefetch((const T*)node_spin + 3 * j);
+                fetch((const T*)node_velocity + 3 * i);
+                fetch((const T*)node_velocity + 3 * j);
+                fetch((const T*)node_spin + 3 * i);
+                fetch((const T*)node_spin + 3 * j);
+                fetch((const T*)node_velocity + 3 * j + 5);
+                fetch((const T*)node_spin + 3 * j + 5);
             }
-            __builtin_prefetch(load + j, 1);
-            __builtin_prefetch(load + j + 1, 1);
+            fetch(load + i);
+            fetch(load + i + 1);
+            fetch(load + j);
+            fetch(load + j + 1);
             if constexpr (HAS_FRICTION) {
-                __builtin_prefetch(written_last + k);
-                __builtin_prefetch(written_now + k, 1);
-                __builtin_prefetch(kept_last + 4 * k);
-                __builtin_prefetch(kept_now + 4 * k, 1);
+                fetch(written_last + k);
+                fetch(written_now + k);
+                fetch(kept_last + 4 * k);
+                fetch(kept_now + 4 * k);
             }
         }
-        if (wholes >= W) run(Whole(), 0, wholes);
-        if (parts >= W) run(Shared(), ROOM, parts);
+        if (hits_of[0] >= W) run(Whole(), 0, hits_of[0]);
+        if (hits_of[1] >= W) run(OneWay(), ROOM, hits_of[1]);
+        if (hits_of[2] >= W) run(TwoWays(), 2 * ROOM, hits_of[2]);
+        if (hits_of[3] >= W) run(AtTips(), 3 * ROOM, hits_of[3]);
     }
-    run_rest(Whole(), 0, wholes);
-    run_rest(Shared(), ROOM, parts);
+    run_rest(Whole(), 0, hits_of[0]);
+    run_rest(OneWay(), ROOM, hits_of[1]);
+    run_rest(TwoWays(), 2 * ROOM, hits_of[2]);
+    run_rest(AtTips(), 3 * ROOM, hits_of[3]);
 """

@@ -18,13 +18,11 @@ def image_constants() -> dict[str, int]:
 _ROWS = """
     typedef double P4 __attribute__((ext_vector_type(4)));
     typedef T T4 __attribute__((ext_vector_type(4)));
-    auto place_row = [&](long node) -> P4 {
-        const double* x = (const double*)place + 3 * node;
-        return P4{x[0], x[1], x[2], x[2]};
-    };
-    auto real_row = [](const T* from, long at) -> T4 {
-        const T* x = from + 3 * at;
-        return T4{x[0], x[1], x[2], x[2]};
+    // of a node and the next one, from two overlapping loads; the fourth numbers mean nothing
+    auto two_rows = [](const auto* from, long node, auto& row, auto& next) {
+        __builtin_memcpy(&row, from + 3 * node, sizeof(row));
+        __builtin_memcpy(&next, from + 3 * node + 2, sizeof(next));
+        next = __builtin_shufflevector(next, next, 1, 2, 3, 3);
     };
     typedef T T8 __attribute__((ext_vector_type(8)));
     auto eight = [](const auto* r, auto& x, auto& y, auto& z) {
@@ -88,9 +86,11 @@ DISTANCE = """
                        V& aa, V& bb, V& ab) -> V3 {
         P4 rows_a[W], rows_b[W], rows_d[W];
         for (int l = 0; l < W; ++l) {
-            const P4 xi = place_row(node_i[l]), xj = place_row(node_j[l]);
-            rows_a[l] = place_row(node_i[l] + 1) - xi;
-            rows_b[l] = place_row(node_j[l] + 1) - xj;
+            P4 xi, xi1, xj, xj1;
+            two_rows((const double*)place, node_i[l], xi, xi1);
+            two_rows((const double*)place, node_j[l], xj, xj1);
+            rows_a[l] = xi1 - xi;
+            rows_b[l] = xj1 - xj;
             rows_d[l] = xj - xi;
         }
         const V3 a = turn(rows_a), b = turn(rows_b);
@@ -100,10 +100,11 @@ DISTANCE = """
         bb = larger(b.dot(b), V(TINY));
         ab = a.dot(b);
         const V da = delta.dot(a), db = delta.dot(b);
-        const V den = larger(aa * bb - ab * ab, EPS * aa * bb);
-        s = clamp01((da * bb - db * ab) / den);
-        t = clamp01((s * ab - db) / bb);
-        s = clamp01((t * ab + da) / aa);
+        const V both = aa * bb, den = larger(both - ab * ab, EPS * both);
+        const V in_all = T(1) / (both * den);
+        s = clamp01((da * bb - db * ab) * (both * in_all));
+        t = clamp01((s * ab - db) * (aa * den * in_all));
+        s = clamp01((t * ab + da) * (bb * den * in_all));
         return delta + b * t - a * s;
     };
 """

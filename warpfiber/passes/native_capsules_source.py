@@ -12,15 +12,16 @@ from warpfiber.model import HALT, precision
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_hits import SWEEP
-from warpfiber.passes.native_capsule_law import NORMAL, POWERS, SHARES, contact_constants
+from warpfiber.passes.native_capsule_law import NORMAL, SHARES, SPRINGS, contact_constants
+from warpfiber.passes.native_capsule_powers import POWERS
 from warpfiber.passes.native_capsule_rows import DISTANCE, image_constants, row_source
 
 # Pairs in both precisions: two registers of eight numbers hide each other's latency.
 LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
-LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
-AHEAD = 4  # blocks of pairs whose nodes are fetched then, else one
+AHEAD = 4  # blocks of pairs whose nodes are fetched
+FAR = 16  # the same of the list itself
 READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
@@ -38,6 +39,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
         "PARTS": PARTS,
         "TIP_BITS": TIP_BITS,
         "AHEAD": AHEAD,
+        "FAR": FAR,
         "SLOT_HALT": HALT,
     }
     numbers |= image_constants()
@@ -77,7 +79,7 @@ _HAND_OVER = """
 _LAW = """
     auto law = [&](auto kind, const int* ats, const T* ss, const T* ts, int count)
         __attribute__((noinline)) {
-        constexpr bool IS_SHARED = decltype(kind)::IS_SHARED;
+        typedef decltype(kind) KIND;
         P4 rows_a[W], rows_b[W], rows_d[W];
         int ks[W], node_i[W], node_j[W];
         I code_i, code_j, images;
@@ -88,8 +90,9 @@ _LAW = """
             ((int*)&code_j)[l] = of_j;
             ((int*)&images)[l] = near_image[at];
             const long at_i = node_i[l] = of_i >> TIP_BITS, at_j = node_j[l] = of_j >> TIP_BITS;
-            const P4 xi = place_row(at_i), xi1 = place_row(at_i + 1);
-            const P4 xj = place_row(at_j), xj1 = place_row(at_j + 1);
+            P4 xi, xi1, xj, xj1;
+            two_rows((const double*)place, at_i, xi, xi1);
+            two_rows((const double*)place, at_j, xj, xj1);
             rows_a[l] = xi1 - xi;
             rows_b[l] = xj1 - xj;
             rows_d[l] = xj - xi;
@@ -99,28 +102,28 @@ _LAW = """
             __builtin_memcpy(&v, from, sizeof(V));
             return v;
         };
-        // a constant of the group of one fiber of every pair
-        auto constant = [&](const int* owner, auto field) -> V {
-            if (one_group) return V(T(0)) + field(groups[0]);
-            V v;
-            for (int l = 0; l < W; ++l)
-                ((T*)&v)[l] = field(groups[fiber_group[segment_fiber[owner[ks[l]]]]]);
-            return v;
-        };
-        #define OF(owner, name) constant(owner, [](const auto& g) -> T { return g.name; })
+        Springs mixed;
+        if (!one_group)
+            mixed = springs_of(
+                typename KIND::Tips(), [&](int side, auto field) -> V {
+                    const int* const owner = side == 0 ? pair_i : pair_j;
+                    V v;
+                    for (int l = 0; l < W; ++l)
+                        ((T*)&v)[l] = field(groups[fiber_group[segment_fiber[owner[ks[l]]]]]);
+                    return v;
+                });
+        const Springs& g = one_group ? alike : mixed;
         const V3 a = turn(rows_a), b = turn(rows_b);
         V3 delta = turn(rows_d);
         add_images(images, delta);
         const M tip0_i = tipped(code_i, 1), tip1_i = tipped(code_i, 2);
         const M tip0_j = tipped(code_j, 1), tip1_j = tipped(code_j, 2);
-        const V radius_i = OF(pair_i, radius), radius_j = OF(pair_j, radius);
-        const V compliance_i = OF(pair_i, compliance), compliance_j = OF(pair_j, compliance);
         V s = of(ss), t = of(ts);
         NORMAL
         const unsigned mine = bits(share.energy > T(0)) & ((1u << count) - 1u);
         if (mine == 0) return;
 
-        const V arm_i = T(0.5) * (distance + radius_i - radius_j), arm_j = distance - arm_i;
+        const V arm_i = T(0.5) * (distance + g.lever), arm_j = distance - arm_i;
         V size = force;
         V3 drag = same3(0, 0, 0);
         T8 memories[W];
@@ -130,8 +133,9 @@ _LAW = """
             for (int l = 0; l < W; ++l) {
                 const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
                 auto between = [&](const T* of, int node, T part) -> T4 {
-                    const T4 start = real_row(of, node);
-                    return start + (real_row(of, node + 1) - start) * part;
+                    T4 start, end;
+                    two_rows(of, node, start, end);
+                    return start + (end - start) * part;
                 };
                 const T* const v = (const T*)node_velocity, * const w = (const T*)node_spin;
                 apart[l] = between(v, node_i[l], s_l) - between(v, node_j[l], t_l);
@@ -142,23 +146,19 @@ _LAW = """
             const V3 slip = turn(apart) + turn(rolled).cross(n);
             const V approach = slip.dot(n);
             const V rest_s = T(1) - s, rest_t = T(1) - t;
-            const V in_i = OF(pair_i, mass), in_j = OF(pair_j, mass);
-            const V tip_i = OF(pair_i, closed ? g.mass : g.end_mass);
-            const V tip_j = OF(pair_j, closed ? g.mass : g.end_mass);
-            const V mass = T(1) / (rest_s * rest_s / (tip0_i ? tip_i : in_i)
-                + s * s / (tip1_i ? tip_i : in_i) + rest_t * rest_t / (tip0_j ? tip_j : in_j)
-                + t * t / (tip1_j ? tip_j : in_j));
+            const V mass = T(1) / (rest_s * rest_s * (tip0_i ? g.tip_i : g.in_i)
+                + s * s * (tip1_i ? g.tip_i : g.in_i)
+                + rest_t * rest_t * (tip0_j ? g.tip_j : g.in_j)
+                + t * t * (tip1_j ? g.tip_j : g.in_j));
+            const V resistance = DASHPOT * beta * root(damped * mass);
             if constexpr (HAS_DASHPOT) {
-                const V resistance = DASHPOT * beta * root(damped * mass);
                 size = larger(size + resistance * approach, V(T(0)));
             }
             if constexpr (HAS_FRICTION) {
-                const V shear = OF(pair_i, shear_compliance) + OF(pair_j, shear_compliance);
-                const V shear_part = T(4) * (compliance_i + compliance_j) / shear;
-                const V k = shear_part * stiffness;
+                const V k = g.shear_part * stiffness;
                 const V3 slide = slip - n * approach;
                 const V twist = T(0.5) * dt * turn(spun).dot(n);
-                const V far_i = la * smaller(s, rest_s), far_j = lb * smaller(t, rest_t);
+                const V far_i = e.la * smaller(s, rest_s), far_j = e.lb * smaller(t, rest_t);
                 T4 kept[W];
                 T before_of[W];
                 __builtin_memset(kept, 0, sizeof(kept));
@@ -184,17 +184,18 @@ _LAW = """
                 const V before = of(before_of);
                 V3 flat = h - n * h.dot(n);
                 flat = flat + n.cross(flat) * twist;
-                V scale = root(h.dot(h)) / larger(root(flat.dot(flat)), V(TINY));
-                scale = depth > before ? scale * root(before / depth) : scale;
-                scale = before > T(0) ? scale : V(T(0));
+                // as long as it was, but shorter where the contact is deeper
+                const M deeper = depth > before;
+                const V scale2 = h.dot(h) * (deeper ? before : V(T(1)))
+                    / (larger(flat.dot(flat), V(SMALL * SMALL)) * (deeper ? depth : V(T(1))));
+                const V scale = before > T(0) ? root(scale2) : V(T(0));
                 V3 path = flat * scale + slide * dt;
-                const V resistance = DASHPOT * beta * root(shear_part * damped * mass);
-                drag = nothing3 - path * k - slide * resistance;
+                drag = nothing3 - path * k - slide * (resistance * g.root_shear);
                 const V whole = root(drag.dot(drag)), limit = friction * size;
                 const M slides = whole > limit;
-                const V part = slides ? limit / larger(whole, V(TINY)) : V(T(1));
-                drag = drag * part;
-                const V back = T(-1) / k;
+                const V pulled = larger(whole, V(TINY)), in_both = T(1) / (pulled * k);
+                drag = drag * (slides ? limit * k * in_both : V(T(1)));
+                const V back = -pulled * in_both;
                 path = V3{slides ? drag.x * back : path.x, slides ? drag.y * back : path.y,
                           slides ? drag.z * back : path.z};
                 const V numbers[8] = {path.x, path.y, path.z, depth, s, t, arm_i, arm_j};
@@ -253,7 +254,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
     const int kept_size = pair_step.shape[1], node_count = place.shape[0];
-    const bool one_group = groups.shape[0] == 1, is_large = node_count > {LARGE};
+    const bool one_group = groups.shape[0] == 1;
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
     {lane_types(name, LANES)}
@@ -275,6 +276,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     wp::uint8* const touch = contact_touch + (long)node_count * part;
     {POWERS}
     {SHARES}
+    {SPRINGS}
     {_HAND_OVER}
     {DISTANCE}
     {law}

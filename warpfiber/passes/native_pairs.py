@@ -18,6 +18,7 @@ import warp as wp
 from warpfiber.laws.lubrication import OUTER
 from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import HALT, PAIR_COUNT, precision
+from warpfiber.passes.native import PREFETCH_NODES
 from warpfiber.passes.native_beads import squeeze_text
 from warpfiber.passes.pairs import (
     IMAGE_BITS,
@@ -120,16 +121,22 @@ NEAR_PAIRS = Template("""
     };
     if (node_pos.shape[0] > fetch_from) {
         // what a cache does not hold is asked for two blocks ahead, its addresses four ahead; into
-        // the second cache: the first one keeps few requests, and stands still when they are many
+        // the second cache: the first one keeps few requests, and stands still when they are many.
+        // Owners are read one after the other: of a small cell only their partners are asked for
         const int capacity = pair_j.shape[0];
-        for (int k = first + 2 * 64; k < first + 3 * 64 && k < capacity; ++k) {
-            const real* i = nodes + 3 * (long long)segment[pair_i.data[k]];
-            const real* j = nodes + 3 * (long long)segment[pair_j.data[k]];
-            __builtin_prefetch(i, 0, 2);
-            __builtin_prefetch(i + 5, 0, 2);
-            __builtin_prefetch(j, 0, 2);
-            __builtin_prefetch(j + 5, 0, 2);
-            if (k + 2 * 64 < capacity) __builtin_prefetch(segment + pair_j.data[k + 2 * 64], 0, 2);
+        const int until = first + 3 * 64 < capacity ? first + 3 * 64 : capacity;
+        auto ask = [&](const int* of) {
+            for (int k = first + 2 * 64; k < until; ++k) {
+                const real* x = nodes + 3 * (long long)segment[of[k]];
+                __builtin_prefetch(x, 0, 2);
+                __builtin_prefetch(x + 5, 0, 2);
+            }
+        };
+        ask(pair_j.data);
+        if (node_pos.shape[0] > $many) {
+            ask(pair_i.data);
+            for (int k = first + 4 * 64; k < until + 2 * 64 && k < capacity; ++k)
+                __builtin_prefetch(segment + pair_j.data[k], 0, 2);
         }
         $fetch
     }
@@ -189,6 +196,7 @@ def near_text(name: str, periodic: bool, *, head: str = "", fetch: str = "", res
         head=head,
         fetch=fetch,
         rest=rest,
+        many=PREFETCH_NODES,
     )
 
 

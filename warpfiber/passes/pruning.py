@@ -23,6 +23,7 @@ import warp as wp
 
 from warpfiber.model import PAIR_COUNT
 from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.native import PREFETCH_NODES, PREFETCH_SHARED
 from warpfiber.passes.native_pairs import BLOCK
@@ -133,7 +134,7 @@ class Pruning:
             self.room = min(pairs.pair_capacity, math.ceil(GROWTH * pairs.pair_count))
             self.close()
         self.count += 1
-        return not bool(self.short.numpy()[0])
+        return not bool(host_view(self.short)[0])
 
     def begin(self) -> list[Launch | Call]:
         """Launches after those of a build."""
