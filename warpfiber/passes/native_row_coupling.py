@@ -4,8 +4,8 @@ When a row first takes another force, what a unit of it does to the balance of e
 fibers is stored. From then on a relaxation is a sum over few rows, those that it puts out of
 balance queue up, and the fibers do not move before all rows are within the tolerance; then their
 motion is added up anew, and the balances that it leaves are looked at.
-Measured, us of a solve, 1000 rods with 1200 rows, mean of strains 4-7, 28-31, 44-47: 229 where fibers
-move at once, 178 so.
+Measured, us of a solve, 1000 rods with 1200 rows, mean of strains 4-7, 28-31, 44-47: 229 where
+fibers move at once, 178 so.
 Source: `native_relaxation`; a coupling n_q.(z_q by a unit force of r), an entry of J S J^T.
 Symbols: `balance` e of a row but for what its own softness adds; `touch` coupling and row.
 Limits: no friction, whose forces have directions that change. Couplings that do not fit are
