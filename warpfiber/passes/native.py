@@ -14,7 +14,11 @@ from warpfiber.model import precision
 # no order take 14 and 23.
 PREFETCH_NODES = 100_000
 # The same for several workers: half of what one of them reads was last written by another, on some
-# machines 170 ns away. Alone, pairs that stay in a cache would take an eighth longer so.
+# machines 170 ns away. Alone, pairs that stay in a cache would take an eighth longer so. Measured,
+# two workers, 20,000 segments: they compute 1.8 times as fast as one where a line takes 26 ns from
+# core to core, 1.25 times where it takes 145 ns (virtual processors change from one to the other
+# within minutes). There the node sweep of a worker takes twice as long once the other has swept
+# pairs, whether positions are asked for in order to write them or forces one block ahead.
 PREFETCH_SHARED = 1_000
 LANES = {"float32": 16, "float64": 8}  # 64 bytes
 
