@@ -28,6 +28,7 @@ from warpfiber.passes.chain_solve import CHI, make_chain_step
 from warpfiber.passes.check_sweeps import CheckFeatures, make_check_sweeps
 from warpfiber.passes.clock import make_clock
 from warpfiber.passes.contact_energy import make_contact_energy
+from warpfiber.passes.contact_losses import make_contact_losses
 from warpfiber.passes.contact_memory import make_carry_memory
 from warpfiber.passes.contact_verdict import make_contact_verdict
 from warpfiber.passes.dual_rows import make_dual_balance, make_dual_step, make_fold_sums
@@ -79,7 +80,7 @@ _HELD_RINGS = BondFeatures(dashpots=True, walls=FLOOR, loads=True, closed=True, 
 _BED = BondFeatures(dashpots=True, walls=FLOOR, pairs=True, wall_friction=True)
 _RINGS = replace(_BED, container=True, closed=True)
 _GRIPPED = replace(_BED, press=2, loads=True, grips=True, planes=1)
-_RUBBING = CapsuleFeatures(periodic=True, dashpot=True, friction=True, closed=True)
+_RUBBING = CapsuleFeatures(True, dashpot=True, friction=True, closed=True, recorded=True)
 _PAIRS = PairFeatures(lubrication="shifted", periodic=True, sheared=True)
 _LISTED = ListFeatures(ALL, (0, 2), True, True, True, True, True)
 _ROWS = RowFeatures(True, FLOOR, "shifted", True)
@@ -104,7 +105,8 @@ FULLEST: tuple[Variant, ...] = (
     (make_bond_losses, (_GRIPPED,)),
     (make_capsule_hits, (_RUBBING,)),
     (make_capsule_pairs, (_RUBBING,)),
-    (make_contact_energy, (_RUBBING, True)),
+    (make_contact_energy, (_RUBBING,)),
+    (make_contact_losses, (True,)),
     (make_carry_memory, (True,)),
     (make_grip_sum, ()),
     (make_measure_bonds, (FLOOR, True, True, 1)),
@@ -160,7 +162,8 @@ PLAINEST: tuple[Variant, ...] = (
     (make_bond_losses, (BondFeatures(),)),
     (make_capsule_hits, (CapsuleFeatures(),)),
     (make_capsule_pairs, (CapsuleFeatures(),)),
-    (make_contact_energy, (CapsuleFeatures(), False)),
+    (make_contact_energy, (CapsuleFeatures(),)),
+    (make_contact_losses, (False,)),
     (make_carry_memory, (False,)),
     (make_measure_bonds, (NONE, False, False)),
     (make_dual_begin, ("hard", False)),

@@ -45,11 +45,11 @@ def make_capsule_contact(name):
         difference = wp.sqrt(wp.max(sp[0] * sp[0] - four * sp[1], zero))
         # (S + D) / (S - D) without the difference of numbers that are nearly equal
         ratio = (sp[0] + difference) * (sp[0] + difference) / (four * sp[1])
-        slope = wp.pow(ratio, slender) - one
+        slope = wp.exp(slender * wp.log(ratio)) - one
         correction = one
         steepness = -quarter
         if slope > zero:
-            lacking = wp.pow(slope, power)
+            lacking = wp.exp(power * wp.log(slope))
             correction = one - lacking
             # d ln rho / d ln P = -S / D
             more = lacking * (one + slope) * sp[0] / (slope * correction * difference)

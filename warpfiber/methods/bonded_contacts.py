@@ -16,6 +16,7 @@ from warpfiber.methods.pair_search import PairSearch
 from warpfiber.model import Model, State
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_hits import part_count
+from warpfiber.passes.contact_losses import RECORD
 from warpfiber.passes.contact_memory import NEVER, launch_memories, make_carry_memory
 from warpfiber.passes.pairs import PairFeatures
 from warpfiber.scene import Scene
@@ -41,6 +42,7 @@ class BondedContacts:
             dashpot=scene.contact.damping > 0.0,
             friction=scene.contact.friction > 0.0,
             closed=len(model.segment_end) > 0,
+            recorded="energy" in scene.record.quantities,
         )
         self.measured = PairFeatures(
             repulsion=False, periodic=self.features.periodic, closed=self.features.closed
@@ -63,6 +65,8 @@ class BondedContacts:
         self.acts = wp.zeros(size, dtype=wp.uint8, device=device)
         self.force = wp.zeros(size, dtype=p.vec3, device=device)
         self.arms = wp.zeros(size, dtype=p.vec4, device=device)
+        recorded = RECORD * size if self.features.recorded else 0
+        self.record = wp.zeros(recorded, dtype=p.vec4, device=device)
         kept = size if self.features.friction else 0
         self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
         self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)

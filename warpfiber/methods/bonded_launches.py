@@ -109,6 +109,7 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         contacts.pair_hit,
         contacts.moment,
         contacts.beside,
+        contacts.record,
         contacts.memory,
         contacts.written,
         state.status,

@@ -23,6 +23,7 @@ from warpfiber.passes.contact_energy import (
     make_contact_energy,
     measure_contact_energy,
 )
+from warpfiber.passes.contact_losses import make_contact_losses
 from warpfiber.passes.executor import Launch
 from warpfiber.scene.planes import slides
 
@@ -72,18 +73,31 @@ class Energies:
         ]
         kernel = make_bond_losses(p.name, spheres.features)
         launches = [Launch("bond losses", kernel, model.fiber_count, inputs, split=True)]
-        if spheres.contacts is not None:
-            kernel = self._contact_kernel(is_step=True)
-            inputs = [*self._contact_inputs(), self.rubbed]
+        contacts = spheres.contacts
+        if contacts is not None and (contacts.features.dashpot or contacts.features.friction):
+            inputs = [
+                wp.float64(spheres.dt),
+                model.segment_node,
+                model.segment_end,
+                contacts.search.list.out_start,
+                contacts.search.list.pair_j,
+                contacts.acts,
+                contacts.record,
+                spheres.state.node_velocity,
+                spheres.node_spin,
+                spheres.state.status,
+                self.rubbed,
+            ]
+            kernel = make_contact_losses(p.name, contacts.features.closed)
             launches.append(
                 Launch("contact losses", kernel, model.segment_count, inputs, split=True)
             )
         return launches
 
-    def _contact_kernel(self, *, is_step: bool) -> Any:
+    def _contact_kernel(self) -> Any:
         contacts = self.spheres.contacts
         assert contacts is not None
-        return make_contact_energy(self.spheres.model.precision.name, contacts.features, is_step)
+        return make_contact_energy(self.spheres.model.precision.name, contacts.features)
 
     def _contact_inputs(self) -> list[Any]:
         spheres, model, state = self.spheres, self.spheres.model, self.spheres.state
@@ -91,7 +105,6 @@ class Energies:
         assert contacts is not None
         pairs = contacts.search.list
         return [
-            wp.float64(spheres.dt),
             spheres.groups,
             model.fiber_node_start,
             model.fiber_group,
@@ -102,15 +115,9 @@ class Energies:
             pairs.pair_j,
             pairs.pair_image,
             spheres.place,
-            state.node_velocity,
-            spheres.node_spin,
             state.step,
-            contacts.acts,
-            contacts.force,
-            contacts.arms,
             contacts.memory,
             contacts.written,
-            state.status,
         ]
 
     # -- what is told -----------------------------------------------------------------------------
@@ -126,7 +133,7 @@ class Energies:
         if not self.told:
             return []
         contacts = self.spheres.contacts is not None
-        return [self._bond_kernel()] + ([self._contact_kernel(is_step=False)] if contacts else [])
+        return [self._bond_kernel()] + ([self._contact_kernel()] if contacts else [])
 
     def measure(self) -> dict[str, float]:
         """Energies in J; those of absent terms are left out."""
@@ -153,7 +160,7 @@ class Energies:
         stored, rubbed = np.zeros(2), np.zeros(2)
         if spheres.contacts is not None:
             stored = measure_contact_energy(
-                self._contact_kernel(is_step=False),
+                self._contact_kernel(),
                 self._contact_inputs(),
                 model.segment_count,
                 model.device,

@@ -20,7 +20,7 @@ from warpfiber.passes.native_bonds_source import (
     TO_NODES,
 )
 from warpfiber.passes.native_capsules import make_native_capsule_pairs
-from warpfiber.passes.native_capsules_source import LINE, PARTS
+from warpfiber.passes.native_capsules_source import KEEPS_LOADS, KEEPS_RECORD, LINE, PARTS
 from warpfiber.passes.native_nodes import fiber_blocks
 from warpfiber.passes.node_blocks import NodeBlocks, aligned_zeros
 
@@ -117,7 +117,7 @@ class NativeBonds:
         assert contacts is not None
         pairs = contacts.search.list
         inputs = [
-            wp.int32(keeps),
+            wp.int32(keeps * KEEPS_LOADS + spheres.energies.told * KEEPS_RECORD),
             p.real(dt),
             p.real(spheres.scene.contact.damping),
             p.real(spheres.scene.contact.friction),
@@ -138,6 +138,7 @@ class NativeBonds:
             contacts.acts,
             contacts.force,
             contacts.arms,
+            contacts.record,
             contacts.memory,
             contacts.written,
             self.contact_load,
@@ -172,6 +173,6 @@ class NativeBonds:
         middle = [self.pair_launch(dt), clock, self.launch(LOADS | END | BEGIN), *meter, *motion]
         end = [self.pair_launch(dt, keeps=True), self.launch(LOADS | END | TO_NODES), *meter]
         if spheres.energies.told:
-            middle = [*end, *begin]
+            middle = [self.pair_launch(dt), *end[1:], *begin]
         device, status = spheres.model.device, spheres.state.status
         return JoinedSteps(begin, middle, end, device, spheres.workers, status)

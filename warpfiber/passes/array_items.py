@@ -24,20 +24,21 @@ def make_items(dtype: Any):
     return read, write
 
 
-# The lines that an item and the next one begin and end in.
+# The lines that items begin and end in.
 FETCH = """
 #if !defined(__CUDA_ARCH__)
     __builtin_prefetch(array.data + i);
-    __builtin_prefetch((const char*)(array.data + i + 2) - 1);
+    __builtin_prefetch((const char*)(array.data + i + COUNT) - 1);
 #endif
 """
 
 
 @cache
-def make_fetch(dtype: Any):
-    """`fetch(array, i)`: on the CPU, asks for an item that is needed soon, into the near cache."""
+def make_fetch(dtype: Any, count: int = 1):
+    """`fetch(array, i)`: on the CPU, asks for items that are needed soon, into the near cache."""
+    text = FETCH.replace("COUNT", str(count))
 
-    @wp.func_native(FETCH)
+    @wp.func_native(text)
     def fetch(array: wp.array(dtype=dtype), i: wp.int32): ...
 
     return fetch

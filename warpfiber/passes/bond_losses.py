@@ -14,8 +14,10 @@ from warpfiber.laws.bond import make_bond
 from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT, make_hertz
 from warpfiber.model import HALT, precision
+from warpfiber.passes.array_items import make_items
 from warpfiber.passes.bond_groups import bond_group_struct, node_struct
 from warpfiber.passes.bonds import SETTLING, BondFeatures
+from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.node_walls import CONTAINER, CORNERS, SIDES, make_concave
 
 LOST = ("bonds", "settling", "walls", "wall friction", "drive")  # columns
@@ -39,6 +41,8 @@ def make_bond_losses(name: str, features: BondFeatures):
     has_dashpots = features.dashpots
     zero, half = real(0.0), real(0.5)
     spring_part, dashpot = real(2.0 / 3.0), real(DASHPOT)
+    point, _ = make_items(wp.vec3d)
+    vector, _ = make_items(vec3)
 
     @wp.func
     def node_at(
@@ -52,9 +56,9 @@ def make_bond_losses(name: str, features: BondFeatures):
     ) -> Node:
         """Place, and speeds a time `back` ago (0: now)."""
         node = Node()
-        node.x = place[i]
-        node.v = node_velocity[i] - back * node_rate[i]
-        node.w = node_spin[i] - back * node_spin_rate[i]
+        node.x = point(place, i)
+        node.v = vector(node_velocity, i) - back * vector(node_rate, i)
+        node.w = vector(node_spin, i) - back * vector(node_spin_rate, i)
         return node
 
     @wp.func
@@ -100,7 +104,7 @@ def make_bond_losses(name: str, features: BondFeatures):
             rubbed = driven - wp.dot(force, now.v + wp.cross(now.w, arm))
         return lost, rubbed, driven
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
     def bond_losses(
         offset: wp.int32,
         dt: wp.float64,
@@ -135,27 +139,21 @@ def make_bond_losses(name: str, features: BondFeatures):
         at_walls = wp.float64(0.0)
         rubbed = wp.float64(0.0)
         driven = wp.float64(0.0)
+        amid = node_at(first, back, place, node_velocity, node_spin, node_rate, node_spin_rate)
+        now = node_at(first, zero, place, node_velocity, node_spin, node_rate, node_spin_rate)
         for i in range(first, last + 1):
+            j = wp.where(i == last, first, i + 1)
+            amid_j = node_at(j, back, place, node_velocity, node_spin, node_rate, node_spin_rate)
+            now_j = node_at(j, zero, place, node_velocity, node_spin, node_rate, node_spin_rate)
             mass = g.mass
             inertia = g.inertia
             if (i == first or i == last) and g.closed == 0:
                 mass = g.end_mass
                 inertia = g.end_inertia
-            amid = node_at(i, back, place, node_velocity, node_spin, node_rate, node_spin_rate)
-            now = node_at(i, zero, place, node_velocity, node_spin, node_rate, node_spin_rate)
             damped = mass * wp.dot(amid.v, now.v) + inertia * wp.dot(amid.w, now.w)
             in_settling += wp.float64(settling * damped)
             if wp.static(has_dashpots):
-                j = i + 1
-                if i == last:
-                    j = first
                 if i < last or g.closed == 1:
-                    amid_j = node_at(
-                        j, back, place, node_velocity, node_spin, node_rate, node_spin_rate
-                    )
-                    now_j = node_at(
-                        j, zero, place, node_velocity, node_spin, node_rate, node_spin_rate
-                    )
                     in_bonds += wp.float64(bond_loss(g.dashpots, amid, amid_j, now, now_j))
             if wp.static(has_walls):
                 for axis in range(3):
@@ -231,6 +229,8 @@ def make_bond_losses(name: str, features: BondFeatures):
                     at_walls += wp.float64(loss)
                     rubbed += wp.float64(slid)
                     driven += wp.float64(drive)
+            amid = amid_j
+            now = now_j
         lost[fiber, 0] = lost[fiber, 0] + dt * in_bonds
         lost[fiber, 1] = lost[fiber, 1] + dt * in_settling
         lost[fiber, 2] = lost[fiber, 2] + dt * at_walls

@@ -11,3 +11,4 @@ class CapsuleFeatures:
     dashpot: bool = False
     friction: bool = False
     closed: bool = False  # some fibers are rings
+    recorded: bool = False  # what dissipates is told of every pair that acts

@@ -20,6 +20,7 @@ from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_hits import part_begin
 from warpfiber.passes.capsule_touch import make_capsule_touch
+from warpfiber.passes.contact_losses import RECORD
 from warpfiber.passes.contact_memory import make_hand_over
 from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
@@ -39,6 +40,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     neighbors_memory = make_hand_over(name, features.closed)
     carried_memory, friction_force = make_friction(name)
     has_dashpot, has_friction = features.dashpot, features.friction
+    is_recorded = features.recorded and (has_dashpot or has_friction)
     zero, half, one = real(0.0), real(0.5), real(1.0)
     dashpot = real(DASHPOT)
     number, set_number = make_items(wp.int32)
@@ -48,7 +50,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     _, set_four = make_items(vec4)
     _, set_nine = make_items(mat33)
     _, set_flag = make_items(wp.uint8)
-    fetch_place, fetch_vector = make_fetch(wp.vec3d), make_fetch(vec3)
+    fetch_place, fetch_vector = make_fetch(wp.vec3d, 2), make_fetch(vec3, 2)
 
     @wp.func
     def ring_of(g: BondGroup) -> wp.int32:
@@ -115,6 +117,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_hit_out: wp.array(dtype=wp.int32),
         hit_moment_out: wp.array(dtype=vec3),
         hit_beside_out: wp.array(dtype=mat33),
+        pair_record_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -216,6 +219,11 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             set_vector(hit_moment_out, hit, wp.cross(n, force))
             set_nine(hit_beside_out, hit, wp.matrix_from_rows(on_i, -on_i, on_j))
             set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
+            if wp.static(is_recorded):
+                first = wp.static(RECORD) * k
+                set_four(pair_record_out, first, vec4(n[0], n[1], n[2], size - push[0]))
+                set_four(pair_record_out, first + 1, vec4(force[0], force[1], force[2], arm_i))
+                set_four(pair_record_out, first + 2, vec4(s, t, arm_j, zero))
 
     return capsule_pairs
 
@@ -235,6 +243,7 @@ def make_gather(name: str, closed: bool):
     four, _ = make_items(vec4)
     nine, _ = make_items(mat33)
     flag, _ = make_items(wp.uint8)
+    fetch_vector, fetch_four, fetch_nine = make_fetch(vec3), make_fetch(vec4), make_fetch(mat33)
 
     @wp.func
     def gather_pairs(
@@ -268,6 +277,12 @@ def make_gather(name: str, closed: bool):
             set_number(acting, found, k)
             found += wp.where(flag(pair_acts, k) != wp.uint8(0), 1, 0)
         for slot in range(begin, found):
+            # those of incoming pairs lie anywhere
+            k = number(acting, wp.min(slot + 2, found - 1))
+            fetch_four(pair_arms, k)
+            fetch_vector(pair_force, k)
+            fetch_vector(hit_moment, number(pair_hit, k))
+            fetch_nine(hit_beside, number(pair_hit, k))
             k = number(acting, slot)
             segment = number(pair_i, k)
             if slot >= incoming:

@@ -1,10 +1,8 @@
-"""Energies of contacts between segments: what is stored now, and what a step dissipates.
+"""Energies of contacts between segments that are stored now.
 
 One thread per segment and its outgoing pairs, as in the sweep over pairs; sums stay with the
 segment, so they do not depend on the number of workers.
-Source: laws `capsule_contact` and `friction`. A force F does the work F . v dt with v the velocity
-    after the second half kick, since nodes have v - a dt / 2 before and v + a dt / 2 after it.
-    Friction dissipates what is put in against it less what its memories store.
+Source: laws `capsule_contact` and `friction`. What is dissipated: `contact_losses`.
 """
 
 from functools import cache
@@ -13,21 +11,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfiber.model import HALT, precision
+from warpfiber.model import precision
 from warpfiber.passes.bond_groups import bond_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 from warpfiber.passes.ring_nodes import make_ring_nodes
 
-# Columns: normal and tangential part; of a measurement stored, of a step put in against dashpots
-# and against all tangential forces.
-NORMAL, TANGENTIAL = range(2)
+NORMAL, TANGENTIAL = range(2)  # columns
 
 
 @cache
-def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
-    """Kernel `contact_energy` (S, 2): adds what a step dissipates, or writes what is stored."""
+def make_contact_energy(name: str, features: CapsuleFeatures):
+    """Kernel `contact_energy` (S, 2): what is stored in springs and in memories of friction."""
     p = precision(name)
     real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
     BondGroup = bond_group_struct(name)
@@ -36,12 +32,11 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
     normal_contact = make_capsule_touch(name, features.closed)
     _, _, _, node_after, _, _ = make_ring_nodes(features.closed)
     has_friction = features.friction
-    zero, half, one = real(0.0), real(0.5), real(1.0)
+    zero, half = real(0.0), real(0.5)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def contact_energy(
         offset: wp.int32,
-        dt: wp.float64,
         groups: wp.array(dtype=BondGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
@@ -52,27 +47,12 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
         place: wp.array(dtype=wp.vec3d),
-        node_velocity: wp.array(dtype=vec3),
-        node_spin: wp.array(dtype=vec3),
         step: wp.array(dtype=wp.int64),
-        pair_acts: wp.array(dtype=wp.uint8),
-        pair_force: wp.array(dtype=vec3),
-        pair_arms: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
-        status: wp.array(dtype=wp.int32),
         energy: wp.array2d(dtype=wp.float64),
     ):
-        if wp.static(is_step):
-            if status[wp.static(HALT)] != 0:
-                return
         i = wp.tid() + offset
-        if wp.static(is_step):
-            acting = wp.int32(0)
-            for k in range(out_start[i], out_start[i + 1]):
-                acting += wp.int32(pair_acts[k])
-            if acting == 0:
-                return
         node_i = segment_node[i]
         fiber_i = segment_fiber[i]
         gi = groups[fiber_group[fiber_i]]
@@ -84,9 +64,6 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
         normal = wp.float64(0.0)
         tangential = wp.float64(0.0)
         for k in range(out_start[i], out_start[i + 1]):
-            if wp.static(is_step):
-                if pair_acts[k] == wp.uint8(0):
-                    continue
             j = pair_j[k]
             node_j = segment_node[j]
             gj = groups[fiber_group[segment_fiber[j]]]
@@ -100,39 +77,21 @@ def make_contact_energy(name: str, features: CapsuleFeatures, is_step: bool):
             c = delta + st[1] * b - st[0] * a
             if wp.length_sq(c) >= reach * reach:
                 continue
-            push, felt, n, springs, _on_i, _on_j = normal_contact(
+            push, felt, _n, _springs, _on_i, _on_j = normal_contact(
                 gi, gj, at_i, at_j, delta, a, b, st, c
             )
             if felt[2] <= zero:
                 continue
-            if wp.static(is_step):
-                arms = pair_arms[k]
-                s = push[2]
-                t = push[3]
-                slip = (one - s) * node_velocity[node_i] + s * node_velocity[end_i]
-                slip -= (one - t) * node_velocity[node_j] + t * node_velocity[end_j]
-                spin = arms[2] * ((one - s) * node_spin[node_i] + s * node_spin[end_i])
-                spin += arms[3] * ((one - t) * node_spin[node_j] + t * node_spin[end_j])
-                slip += wp.cross(spin, n)
-                force = pair_force[k] - springs
-                along = wp.dot(force, n) * wp.dot(slip, n)
-                normal -= wp.float64(along)
-                tangential -= wp.float64(wp.dot(force, slip) - along)
-            else:
-                normal += wp.float64(felt[2])
-                if wp.static(has_friction):
-                    if pair_step[now & 1, k] == now:
-                        kept = pair_memory[now & 1, k]
-                        shear = gi.shear_compliance + gj.shear_compliance
-                        ratio = real(4.0) * (gi.compliance + gj.compliance) / shear
-                        h = vec3(kept[0], kept[1], kept[2])
-                        tangential += wp.float64(half * ratio * push[1] * wp.length_sq(h))
-        if wp.static(is_step):
-            energy[i, wp.static(NORMAL)] = energy[i, wp.static(NORMAL)] + dt * normal
-            energy[i, wp.static(TANGENTIAL)] = energy[i, wp.static(TANGENTIAL)] + dt * tangential
-        else:
-            energy[i, wp.static(NORMAL)] = normal
-            energy[i, wp.static(TANGENTIAL)] = tangential
+            normal += wp.float64(felt[2])
+            if wp.static(has_friction):
+                if pair_step[now & 1, k] == now:
+                    kept = pair_memory[now & 1, k]
+                    shear = gi.shear_compliance + gj.shear_compliance
+                    ratio = real(4.0) * (gi.compliance + gj.compliance) / shear
+                    h = vec3(kept[0], kept[1], kept[2])
+                    tangential += wp.float64(half * ratio * push[1] * wp.length_sq(h))
+        energy[i, wp.static(NORMAL)] = normal
+        energy[i, wp.static(TANGENTIAL)] = tangential
 
     return contact_energy
 

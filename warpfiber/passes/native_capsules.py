@@ -3,7 +3,7 @@
 A pair is a lane, and nothing in a lane depends on the others. Near pairs are in PARTS; each adds
 the loads of its contacts to a line of numbers per node of its own, which the sweep over bonds adds
 up in turn, so a sum does not depend on the number of workers. What a pair does is stored by pair
-only if asked for: most of the time would go into that.
+only if asked for : most of the time would go into that.
 
 Limits: CPU only (clang vector types), else `capsule_pairs`; multiplications and additions are
     fused and powers are by series: equal to rounding.
@@ -22,7 +22,7 @@ from warpfiber.passes.native_capsules_source import capsule_sweep_source
 ARRAYS = """
     groups fiber_group segment_fiber lattice out_start part_start near_count near_pair near_i near_j
     near_image pair_i pair_j pair_image place node_velocity node_spin step pair_acts
-    pair_force pair_arms pair_memory pair_step contact_load contact_touch status
+    pair_force pair_arms pair_record pair_memory pair_step contact_load contact_touch status
 """.split()
 
 
@@ -62,6 +62,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_force: wp.array(dtype=vec3),
         pair_arms: wp.array(dtype=vec4),
+        pair_record: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         contact_load: wp.array(dtype=real),
@@ -98,6 +99,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_force_out: wp.array(dtype=vec3),
         pair_arms_out: wp.array(dtype=vec4),
+        pair_record_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
         contact_load: wp.array(dtype=real),
@@ -132,6 +134,7 @@ def make_native_capsule_pairs(name: str, features: CapsuleFeatures):
             pair_acts,
             pair_force_out,
             pair_arms_out,
+            pair_record_out,
             pair_memory,
             pair_step,
             contact_load,

@@ -10,6 +10,7 @@ Symbols: as in `capsule_pairs`; T real, V vector of T, k places in the list, `at
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, precision
 from warpfiber.passes.capsule_features import CapsuleFeatures
+from warpfiber.passes.contact_losses import RECORD
 from warpfiber.passes.native import lane_types
 from warpfiber.passes.native_capsule_hits import SWEEP
 from warpfiber.passes.native_capsule_law import NORMAL, SHARES, SPRINGS, contact_constants
@@ -23,6 +24,7 @@ TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one 
 AHEAD = 4  # blocks of pairs whose nodes are fetched
 FAR = 16  # the same of the list itself
 READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
+KEEPS_LOADS, KEEPS_RECORD = 1, 2  # what is stored by pair; see `contact_losses`
 LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
 
 
@@ -41,6 +43,9 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
         "AHEAD": AHEAD,
         "FAR": FAR,
         "SLOT_HALT": HALT,
+        "KEEPS_LOADS": KEEPS_LOADS,
+        "KEEPS_RECORD": KEEPS_RECORD,
+        "RECORD": RECORD,
     }
     numbers |= image_constants()
     lines += [f"constexpr int {key} = {value};" for key, value in numbers.items()]
@@ -239,14 +244,25 @@ _LAW = """
                 step_now[k] = now;
             }
             if (keeps) {
+                auto lane = [&](const V& v) -> T { return ((const T*)&v)[l]; };
                 pair_acts[k] = 1;
-                T* f = (T*)pair_force + 3 * k;
-                T* arms = (T*)pair_arms + 4 * k;
-                for (int c = 0; c < 3; ++c) f[c] = ((const T*)(&whole.x + c))[l];
-                arms[0] = ((const T*)&s)[l];
-                arms[1] = ((const T*)&t)[l];
-                arms[2] = ((const T*)&arm_i)[l];
-                arms[3] = ((const T*)&arm_j)[l];
+                if (keeps & KEEPS_LOADS) {
+                    T* f = (T*)pair_force + 3 * k;
+                    T* arms = (T*)pair_arms + 4 * k;
+                    for (int c = 0; c < 3; ++c) f[c] = lane((&whole.x)[c]);
+                    arms[0] = lane(s);
+                    arms[1] = lane(t);
+                    arms[2] = lane(arm_i);
+                    arms[3] = lane(arm_j);
+                }
+                if (keeps & KEEPS_RECORD) {
+                    T* record = (T*)pair_record + 4 * RECORD * k;
+                    const T8 acting = {lane(n.x), lane(n.y), lane(n.z), lane(size - force),
+                                       lane(drag.x), lane(drag.y), lane(drag.z), lane(arm_i)};
+                    const T4 where = {lane(s), lane(t), lane(arm_j), T(0)};
+                    __builtin_memcpy(record, &acting, sizeof(T8));
+                    __builtin_memcpy(record + 8, &where, sizeof(T4));
+                }
             }
         }
     };
