@@ -69,15 +69,18 @@ def _constants(features: BondFeatures) -> str:
 # Loads of contacts: the parts of the pair sweep in turn; a node without any has the first line, of
 # zeros.
 _GATHER = """
+    const wp::uint8* const touched = contact_touch;
+    const long all_nodes = node_count;
     for (int k = 0; k < nodes; ++k) {
         V r[W];
         #pragma unroll
         for (int l = 0; l < W; ++l) {
             const long node = first[l] + k;
-            r[l] = load_lines[(1 + node) * contact_touch[node]];
+            r[l] = load_lines[(1 + node) * touched[node]];
+            #pragma unroll
             for (int p = 1; p < PARTS; ++p) {
-                const long line = 1 + node + (long)node_count * p;
-                r[l] += load_lines[line * contact_touch[line - 1]];
+                const long line = 1 + node + all_nodes * p;
+                r[l] += load_lines[line * touched[line - 1]];
             }
         }
         TRANSPOSE

@@ -1,7 +1,8 @@
-"""C++ text of the normal contact of eight pairs of segments, one lane per pair.
+"""C++ text of the normal contact of pairs of segments, one lane per pair.
 
-The laws `capsule_contact` and `capsule_patch` as in `capsule_touch`, branches as masks. Powers are
-exponentials of logarithms, both by series to rounding.
+The laws `capsule_contact` and `capsule_patch` as in `capsule_touch`, branches as masks or, where
+they are rare, as kinds of pairs of their own (`native_capsule_hits`). Divisions that share a factor
+are one: most of the time would go into them.
 Symbols: as in `capsule_patch`; `tip0_`, `tip1_` lanes whose segment is the first or the last one of
     its fiber.
 """
@@ -196,8 +197,8 @@ SHARES = """
     };
 """
 
-# Constants of the groups of pairs: `of(side, field)` of one side, with an end of its fiber for
-# RATES. Rounds: rigidities of tips.
+# Constants of the groups of pairs, `of(side, field)` those of one side; of all pairs at once where
+# there is one group. Rounds: rigidities of tips.
 SPRINGS = """
     struct Springs {
         V reach, lever, sum, root_product, modulus, round_i, round_j, round_both;
