@@ -354,7 +354,7 @@ def main() -> None:
     parser.add_argument("--plain", action="store_true", help="on the CPU what CUDA runs")
     parser.add_argument("--precisions", nargs="*", default=["float64", "float32"])
     parser.add_argument("--cell-fibers", type=int, default=1000, help="of `contact`")
-    parser.add_argument("--explicit", type=float, default=2.0, help="strain, of `contact`")
+    parser.add_argument("--explicit", type=float, help="strain, of `contact`; else --strain")
     parser.add_argument("--fraction", type=float, default=0.29, help="where `dem` starts")
     parser.add_argument("--volume", type=float, default=1.0, help="part of the fibers, of `plate`")
     parser.add_argument("--steps", type=int, default=400, help="of one repeat of `dem`")

@@ -1,6 +1,7 @@
 """Where the time of a step goes: every pass of a scene, its memory traffic, and the neighbor list.
 
     python tools/profile_step.py SCENE.toml [--set key=value] [--device D] [--steps N] [--warm N]
+        [--workers W]
 
 Bytes: every array that a kernel may read or write, once each, pair arrays up to the pairs in use:
 what a full sweep must move at least. They are compared with a copy of as many bytes by one core
@@ -9,6 +10,8 @@ memory. One above it ended before it needed its arrays (no pair was near, nothin
 repeat). Passes of one name count together; of a sort or a scan of Warp the bytes are not known.
 Overhead: whole steps less their passes, timed apart. Times of passes are medians over steps, so
 what only some steps do (second solves, long relaxations, steps taken again) is in it.
+With --workers W (2 or more) also what each worker computes in a step, list builds apart, and how
+long it waits for the others: mean processor time by pass, and time.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ import warp as wp
 from machine import commit, copy_bandwidth, processor
 
 import warpfiber as wf
-from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.executor import Call, Executor, Launch
+from warpfiber.passes.worker_times import WorkerTimes, clock_address
 from warpfiber.scene import parse_override
 
 # Arguments that a kernel both reads and writes.
@@ -93,6 +97,32 @@ def profile(args: argparse.Namespace) -> None:
     print(line("step", whole))
     if method.list is not None:
         print_list(method, count, builds, seconds - pruning, steps, pruning)
+    simulation.close()
+    if args.workers > 1 and on_cpu:
+        profile_workers(scene, args)
+
+
+def profile_workers(scene: wf.Scene, args: argparse.Namespace) -> None:
+    """What every one of several workers does in a step."""
+    simulation = wf.Simulation(scene, device=args.device, workers=args.workers)
+    method = simulation.method
+    simulation.step(args.warm)
+    simulation.prepare()
+    if type(method.executor) is not Executor or not clock_address():
+        print("workers       joined steps, or no clock: not timed apart")
+        simulation.close()
+        return
+    times, count = WorkerTimes(method.executor), simulation.model.segment_count
+    while times.steps < args.steps and times.executor is method.executor:
+        simulation.step(1)  # does what halts steps
+        if times.executor is method.executor:
+            times.step()
+    for worker in range(args.workers):
+        busy = times.busy(worker)
+        parts = ", ".join(f"{name} {seconds * 1e6:.1f}" for name, seconds in busy.items())
+        whole = sum(busy.values())
+        print(f"worker {worker + 1:<7}{whole * 1e6:.1f} us ({parts}), ", end="")
+        print(f"{whole / count * 1e9:.1f} ns/seg, waits {times.waiting(worker) * 1e6:.1f} us")
     simulation.close()
 
 
@@ -166,6 +196,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--steps", type=int, default=512)
     parser.add_argument("--warm", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=1)
     profile(parser.parse_args())
 
 

@@ -77,7 +77,7 @@ def test_rows_are_filled_the_same(meeting: Meeting, method: str, precision: str)
 def test_lines_that_cross_or_coincide(meeting: Meeting) -> None:
     """There the normal is that of both lines."""
     sim = meeting("rigid_rod", 75)
-    sim.step(10)
+    sim.step(9)
     sim.method.prepare()
     rows, model = contact_rows(sim), sim.model
     i, j, code = sim.method.list.host_pairs()  # type: ignore[union-attr]

@@ -100,9 +100,10 @@ def test_block_bounds_the_list_as_the_plain_kernel(meeting: Meeting, precision: 
         use, share = (
             wp.zeros(dim, dtype=array.dtype, device=model.device) for array in inputs[-2:]
         )
-        inputs[-3:] = [wp.zeros(dim, dtype=wp.int32, device=model.device), use, share]
+        inputs[-3:] = [wp.zeros(dim, dtype=wp.int64, device=model.device), use, share]
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=model.device)
-        most = use.numpy().max(axis=0), share.numpy().max(), inputs[-3].numpy().max()
+        short = float(inputs[-3].numpy().any())
+        most = use.numpy().max(axis=0), share.numpy().max(), short
         moved = check.segment_moved.numpy().astype(float)
         found.append([*most, moved.copy(), float(check.step_strain.numpy()[0])])
     for plain, block in zip(*found, strict=True):

@@ -33,11 +33,13 @@ def test_every_pass_has_a_line(
     if method == "bead_chain":
         del given["numerics.strain_step"]
     scene = ROOT / "scenes" / "sasayama_2018" / "shear_cell.toml"
-    args = Namespace(scene=scene, set=list(given.items()), device="cpu", steps=16, warm=8)
+    args = Namespace(
+        scene=scene, set=list(given.items()), device="cpu", steps=16, warm=8, workers=2
+    )
     seen: list[Any] = []
     begin = tool.wf.Simulation
     monkeypatch.setattr(
-        tool.wf, "Simulation", lambda *a, **k: seen.append(begin(*a, **k)) or seen[0]
+        tool.wf, "Simulation", lambda *a, **k: seen.append(begin(*a, **k)) or seen[-1]
     )
     names: list[str] = []
     launches = tool.bytes_moved
@@ -60,3 +62,6 @@ def test_every_pass_has_a_line(
     assert f"{pairs.pair_count / seen[0].model.segment_count:.3f} per segment" in text
     assert ("wide list" in text) == (method == "bead_chain")
     assert ("contact rows" in text) == (method != "bead_chain")
+    workers = [row for row in rows if row.startswith("worker")]
+    assert len(workers) == 2
+    assert all(f"{name} " in row for name in passes for row in workers)

@@ -33,6 +33,9 @@ STEP_PAIR_COST = 8.0
 PRUNED_FROM = 2000  # segments; pruning smaller lists costs its calls more than it saves
 MOST_LONGER = 1.5  # times that the next list may last longer because its segments are extended
 SPARE = 1.1
+# Pairs per segment that there is room for from the start where segments are listed longer, in cells
+# so small that growing by and by, with launches captured anew, would cost more than steps.
+ROOMY, MOST_ROOMY = 7, 20_000
 MEAN_SLIDE = 0.4  # of the farthest; where each segment has an extension of its own
 
 
@@ -70,6 +73,8 @@ class PairSearch:
         if scene.numerics.skin is not None:
             skin = scene.numerics.skin / model.units.length
         prunes = prunes and scene.numerics.skin is None and model.segment_count >= PRUNED_FROM
+        segments = model.segment_count
+        roomy = slides and segments <= MOST_ROOMY
         origin = np.zeros(3)
         if scene.flow is not None and scene.flow.origin is not None:
             origin = np.asarray(scene.flow.origin) / model.units.length
@@ -82,6 +87,7 @@ class PairSearch:
             stretch=stretch,
             workers=workers,
             native=native,
+            pair_capacity=max(64, ROOMY * segments) if roomy else None,
             flow_origin=origin if prunes else None,
             slide_origin=origin if slides else None,
         )

@@ -69,20 +69,25 @@ COLUMNS = """
         const int size = size_of(f);
         for (int c = 0; c < size; c += W) *(U*)(mine + c) += change * *(const U*)(column + c);
     };
+    auto reply_of = column_of;
+    // along the normal of row q
+    auto felt = [&](const T* column, int f, int q, int end) -> T {
+        const Row& row = rows[q];
+        const int at = (end == 0 ? row.at_i : row.at_j) - d.fiber_at.data[f];
+        const Q* const z = (const Q*)(column + at);
+        const Q v = z[0] + (end == 0 ? row.s : row.t) * (z[1] - z[0]);
+        return row.normal[0] * v[0] + row.normal[1] * v[1] + row.normal[2] * v[2];
+    };
     auto diagonal_of = [&](int r) -> T {
-        const Row& row = rows[r];
         const int on[2] = {states[r].fiber_i, states[r].fiber_j};
-        const int at[2] = {row.at_i, row.at_j};
-        const T share[2] = {row.s, row.t};
+        const int at[2] = {rows[r].at_i, rows[r].at_j};
         T diagonal = T(0);
         for (int side = 0; side < 2; ++side) {
             if (at[side] == still) continue;
             const T* const column = column_of(on[side], r, side);
             for (int end = 0; end < 2; ++end) {  // a fiber may meet itself, or its own image
                 if (on[end] != on[side]) continue;
-                const Q* const z = (const Q*)(column + at[end] - d.fiber_at.data[on[end]]);
-                const Q v = z[0] + share[end] * (z[1] - z[0]);
-                const T e = row.normal[0] * v[0] + row.normal[1] * v[1] + row.normal[2] * v[2];
+                const T e = felt(column, on[side], r, end);
                 diagonal += end == 0 ? -e : e;
             }
         }

@@ -23,6 +23,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.list_bound import make_list_bound
 from warpfiber.passes.native_check import make_native_check
+from warpfiber.passes.native_strays import LANES, PLANES, make_native_strays, most_strays
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import native_chunks
 from warpfiber.passes.unilateral import ContactDual
@@ -100,6 +101,12 @@ class ContactCheck:
             self.kernels["check_again"] = renewed["check_segments"]
             self.kernels["reduce_again"] = renewed["reduce_check"]
         self.kernels |= make_list_bound(name, module, self.native)
+        # segments off their lines that the list may still hold
+        self.strays = most_strays(model.segment_count) if self.native else 0
+        if self.strays > 0:
+            self.kernels["bound_list"] = make_native_strays(name, module)
+        planes = PLANES * (model.segment_count + LANES) if self.strays else 0
+        self.stray_planes = wp.zeros(planes, dtype=wp.float32, device=model.device)
         self.kernels |= make_contact_verdict(module)
         segments = model.segment_count
         self.overlap = wp.zeros(segments, dtype=model.precision.real, device=model.device)
@@ -112,7 +119,7 @@ class ContactCheck:
         self.found = self._int(5)
         # by runs of segments or by fibers
         bounded = native_chunks(segments) if self.native else model.fiber_count
-        self.part_short = self._int(bounded)
+        self.part_short = wp.zeros(bounded, dtype=wp.int64, device=model.device)
         self.list_short = self._int(1)
         vec3, device = model.precision.vec3, model.device
         self.part_use = wp.zeros(bounded, dtype=vec3, device=device)
@@ -219,6 +226,7 @@ class ContactCheck:
         bound = [
             model.precision.vec3(*flow_origin),
             model.segment_count,
+            self.strays,
             model.segment_node,
             self.pairs.skin_out,
             self.pairs.segment_extension,
@@ -238,10 +246,32 @@ class ContactCheck:
             self.part_share,
         ]
         reduced = [self.part_short, self.part_use, self.part_share, state.status]
+        if self.strays > 0:
+            reduced = self._strays(node_pos)
         reduced += [self.list_short, self.list_use, self.list_share]
         return [
             self._launch("bound_fibers", self.part_short.shape[0], bound, split=True),
             self._launch("bound_list", 1, reduced),
+        ]
+
+    def _strays(self, node_pos: Any) -> list[Any]:
+        model, pairs = self.model, self.pairs
+        return [
+            self.strays,
+            pairs.skin_out,
+            wp.vec3i(*(int(wraps) for wraps in model.domain.periodic)),
+            model.segment_node,
+            model.segment_fiber,
+            pairs.fiber_skip,
+            pairs.out_start,
+            pairs.pair_j,
+            pairs.pair_image,
+            self.lattice_now,
+            node_pos,
+            self.part_short,
+            self.part_use,
+            self.state.status,
+            self.stray_planes,
         ]
 
     def foresee(self, rejected: Any) -> Launch:

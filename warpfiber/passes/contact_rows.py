@@ -25,7 +25,7 @@ from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.native_row_fill import fill_pairs, make_native_row_fill
 from warpfiber.passes.native_row_slots import FIRST, LAST
 from warpfiber.passes.neighbors import NeighborList
-from warpfiber.passes.pair_motion import make_pair_motion, native_chunks
+from warpfiber.passes.pair_motion import CHUNK_SEGMENTS, make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
 from warpfiber.passes.row_fill import KEY_IMAGE, make_row_fill
 from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
@@ -33,6 +33,7 @@ from warpfiber.passes.row_slip import Friction, RowSlip, make_row_slip
 KEEP = 0.5  # radii of the thinner fiber: rows with a smaller predicted gap, unless told otherwise
 NEVER = -1e20  # radii: no gap is that small
 GROWTH = 1.3
+SPARE_ROWS = 20_000  # at first, beside one per segment: launches are captured anew when rows grow
 FAR = 1e30  # run units: motion of which nothing is known
 
 
@@ -118,7 +119,7 @@ class ContactRows:
         joined = np.concatenate([[False], fiber[1:] == fiber[:-1], [False]])
         ends = FIRST * ~joined[:-1] + LAST * ~joined[1:]
         self.segment_ends = wp.array(ends, dtype=wp.uint8, device=model.device)
-        self._allocate_rows(capacity or max(64, segments))
+        self._allocate_rows(capacity or max(64, segments + min(segments, SPARE_ROWS)))
         self._fit_pairs()
 
     # -- arrays -----------------------------------------------------------------------------------
@@ -191,7 +192,7 @@ class ContactRows:
         ]
         rub = self.rub
         return [
-            self._launch("carry_rows", self._carry_inputs()),
+            self._carry(),
             *([rub.carry(self.kernels, self)] if rub is not None else []),
             *([] if self.features.chosen else [self._motion(self.state.node_pos, self.pair_clear)]),
             # chooses the rows anew
@@ -247,8 +248,10 @@ class ContactRows:
         sizes = [widest, self.keep, self.near_now, looked_at, wet]
         return [*(real(size) for size in sizes), int(settles)]
 
-    def _carry_inputs(self) -> list[Any]:
-        return [
+    def _carry(self) -> Launch:
+        segments, native = self.model.segment_count, self.model.device.startswith("cpu")
+        inputs = [
+            CHUNK_SEGMENTS if native else 1,
             self.row_out_start,
             self.row_j,
             self.row_key,
@@ -259,6 +262,8 @@ class ContactRows:
             self.carried_key,
             self.carried_force,
         ]
+        runs = native_chunks(segments) if native else segments
+        return Launch("carry_rows", self.kernels["carry_rows"], runs, inputs, split=True)
 
     def _walls(self) -> list[Any]:
         vec3, domain = self.model.precision.vec3, self.model.domain

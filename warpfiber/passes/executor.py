@@ -195,29 +195,51 @@ class Executor:
     def _capture_worker(self, steps: int, worker: int) -> Any:
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for _ in range(steps):
-                self._record(self.items, worker)
+                self.record(self.items, worker)
         return capture.graph
 
-    def _record(self, items: Sequence[Launch | Call | Repeat], worker: int) -> None:
-        """This worker's part of the items, and where it waits for the others."""
+    def record(
+        self,
+        items: Sequence[Launch | Call | Repeat],
+        worker: int,
+        look: Callable[[str | None], None] | None = None,
+    ) -> None:
+        """This worker's part of the items, and where it waits for the others.
+
+        `look` records what looks at clocks behind a launch of this name, or a barrier (None).
+        """
         for k, item in enumerate(items):
             if isinstance(item, Repeat):
-                self._record_loop(item, worker)
+                self._record_loop(item, worker, look)
                 continue
             item.run(self.device, worker, self.workers)
+            if look is not None:
+                look(item.name)
             behind = items[k + 1] if k + 1 < len(items) else None
             if not (isinstance(behind, Launch | Call) and behind.follows):
-                self._barrier.record(worker)
+                self._meet(worker, look)
 
-    def _record_loop(self, loop: Repeat, worker: int) -> None:
+    def _record_loop(
+        self, loop: Repeat, worker: int, look: Callable[[str | None], None] | None
+    ) -> None:
         """All workers must have looked whether it goes on before any of them may change that."""
 
         def body() -> None:
-            self._barrier.record(worker)
-            self._record(flat([loop]), worker)
+            self._meet(worker, look)
+            self.record(flat([loop]), worker, look)
 
         wp.capture_while(loop.going, body)
+        self._meet(worker, look)
+
+    def _meet(self, worker: int, look: Callable[[str | None], None] | None) -> None:
         self._barrier.record(worker)
+        if look is not None:
+            look(None)
+
+    def replay(self, handles: Any) -> None:
+        """Other graphs of the workers, once."""
+        assert self._pool is not None
+        self._pool.crew.replay(handles)
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
         """Replay up to `steps` steps, looking at `halted` after every graph."""

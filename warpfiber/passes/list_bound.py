@@ -72,6 +72,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         offset: wp.int32,
         flow_origin: vec3,
         segments: wp.int32,
+        spares: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
         segment_extension: wp.array(dtype=real),
@@ -87,7 +88,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
-        short_out: wp.array(dtype=wp.int32),
+        short_out: wp.array(dtype=wp.int64),
         use_out: wp.array(dtype=vec3),
         share_out: wp.array(dtype=real),
     ):
@@ -101,7 +102,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             step_strain_out[0] = largest_strain(push)
             if is_new(deformation_back):
                 pairs_known_out[0] = 0
-        found = wp.int32(0)
+        found = wp.int64(0)
         slid = zero
         across = zero
         most = zero
@@ -122,7 +123,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
                 nearest = wp.clamp(s, -beyond, one + beyond)
                 off = wp.length_sq(apart - nearest * axis)
                 if not (off <= limit * limit):
-                    found = 1
+                    found = wp.int64(1)
                 most = wp.max(most, off)
                 slid = wp.max(slid, wp.max(-s, s - one) * length)
                 across = wp.max(across, wp.length_sq(apart - s * axis))
@@ -131,14 +132,14 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             s_at = i - fiber
             segment_moved_out[s_at] = wp.sqrt(moved2) + segment_shift[s_at] + shift_again[s_at]
         if limit < zero:
-            found = 1
+            found = wp.int64(1)
         short_out[fiber] = found
         use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
         share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
 
     @wp.kernel(**options)
     def bound_list(
-        fiber_short: wp.array(dtype=wp.int32),
+        fiber_short: wp.array(dtype=wp.int64),
         fiber_use: wp.array(dtype=vec3),
         fiber_share: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
@@ -153,7 +154,8 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         share = zero
         for fiber in range(fiber_short.shape[0]):
             share = wp.max(share, fiber_share[fiber])
-            found = wp.max(found, fiber_short[fiber])
+            if fiber_short[fiber] != wp.int64(0):
+                found = 1
             use = wp.max(use, fiber_use[fiber])
         list_short_out[0] = found
         list_use_out[0] = use
@@ -195,6 +197,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         affine: mat33,
         push: mat33,
         limit: real,
+        spares: wp.int32,
         extension: real,
         segment_extension: wp.array(dtype=real),
         segment_node: wp.array(dtype=wp.int32),
@@ -204,7 +207,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         segment_shift: wp.array(dtype=real),
         shift_again: wp.array(dtype=real),
         segment_moved: wp.array(dtype=real),
-        short_out: wp.array(dtype=wp.int32),
+        short_out: wp.array(dtype=wp.int64),
         use_out: wp.array(dtype=vec3),
         share_out: wp.array(dtype=real),
     ): ...
@@ -214,6 +217,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         offset: wp.int32,
         flow_origin: vec3,
         segments: wp.int32,
+        spares: wp.int32,
         segment_node: wp.array(dtype=wp.int32),
         list_sizes: wp.array(dtype=real),
         segment_extension: wp.array(dtype=real),
@@ -229,7 +233,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         pairs_known_out: wp.array(dtype=wp.int32),
         step_strain_out: wp.array(dtype=real),
         segment_moved_out: wp.array(dtype=real),
-        short_out: wp.array(dtype=wp.int32),
+        short_out: wp.array(dtype=wp.int64),
         use_out: wp.array(dtype=vec3),
         share_out: wp.array(dtype=real),
     ):
@@ -251,6 +255,7 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
             affine,
             push,
             farthest_motion(affine, list_sizes),
+            spares,
             list_sizes[2],
             segment_extension,
             segment_node,

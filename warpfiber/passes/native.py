@@ -74,12 +74,14 @@ def transfers(kind: str, lanes: int) -> str:
     return f"""
     auto load_{kind} = [&](int c, {kind}* to, const auto* from) __attribute__((noinline)) {{
         const int size = c * nodes;
+        decltype(from) row[W];
+        #pragma unroll
+        for (int l = 0; l < W; ++l) row[l] = from + (long)c * first[l];
         for (int next = 0; next < size; next += W) {{
             const int at = next < size - W ? next : size - W;
             {kind} r[W];
             #pragma unroll
-            for (int l = 0; l < W; ++l)
-                __builtin_memcpy(&r[l], from + (long)c * first[l] + at, sizeof({kind}));
+            for (int l = 0; l < W; ++l) __builtin_memcpy(&r[l], row[l] + at, sizeof({kind}));
             {turn}
             #pragma unroll
             for (int l = 0; l < W; ++l) to[at + l] = r[l];
@@ -87,14 +89,19 @@ def transfers(kind: str, lanes: int) -> str:
     }};
     auto store_{kind} = [&](int c, auto* to, const {kind}* from) __attribute__((noinline)) {{
         const int size = c * nodes;
+        decltype(to) row[W];
+        #pragma unroll
+        for (int l = 0; l < W; ++l) row[l] = to + (long)c * first[l];
+        const bool all = own == W;
         for (int next = 0; next < size; next += W) {{
             const int at = next < size - W ? next : size - W;
             {kind} r[W];
             #pragma unroll
             for (int l = 0; l < W; ++l) r[l] = from[at + l];
             {turn}
-            for (int l = 0; l < own; ++l)
-                __builtin_memcpy(to + (long)c * first[l] + at, &r[l], sizeof({kind}));
+            #pragma unroll
+            for (int l = 0; l < W; ++l)
+                if (all || l < own) __builtin_memcpy(row[l] + at, &r[l], sizeof({kind}));
         }}
     }};
 """

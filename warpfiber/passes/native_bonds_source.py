@@ -18,7 +18,7 @@ from warpfiber.passes.native_bond_law import BONDS, bond_constants
 from warpfiber.passes.native_capsules_source import PARTS
 
 LANES = 8  # fibers, in both precisions
-LARGE = 50_000  # nodes: no cache holds from step to step what is read of so many
+LARGE = 1_000  # nodes: no cache holds from step to step what is read of so many
 LOADS, END, BEGIN = 1, 2, 4
 """What a launch does, in this order: accelerations, half kick, half kick with drift."""
 FROM_NODES, TO_NODES = 8, 16

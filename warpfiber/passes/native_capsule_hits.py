@@ -72,11 +72,11 @@ SWEEP = """
             | (t < T(0.5) ? tipped(code_j, 1) : tipped(code_j, 2));
         const V size = ab < T(0) ? -ab : ab;
         const unsigned shared = bits(~whole), tips = bits(at_tip);
-        const unsigned crossed = bits(size < BOTH_WAYS * both);
+        const unsigned two_ways = bits(at_tip | (size < BOTH_WAYS * both));
         for (unsigned left = bits(hit) & ((1u << count) - 1u); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
-            const int kind = !(shared >> l & 1) ? 0
-                : (tips >> l & 1 ? 3 : (crossed >> l & 1 ? 2 : 1));
+            // without a branch: whole, one way, two ways, tips
+            const int kind = (shared >> l & 1) * (1 + (two_ways >> l & 1) + (tips >> l & 1));
             const int slot = kind * ROOM + hits_of[kind]++;
             hit_at[slot] = first + l;
             hit_s[slot] = ((const T*)&s)[l];

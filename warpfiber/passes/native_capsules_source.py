@@ -221,13 +221,18 @@ _LAW = """
         load_row(1, whole * s - couple_i, s);
         load_row(2, couple_j - whole * (T(1) - t), T(1) - t);
         load_row(3, nothing3 - couple_j - whole * t, t);
+        // not read again from memory behind every store
+        T8* const lines = load_lines, * const own = load;
+        wp::uint8* const touched = touch;
+        T* const memory_now = kept_now;
+        int* const step_now = written_now;
+        const long before = part_line;
         for (unsigned left = mine; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             auto add = [&](int node, T8 values) {
                 // the line of a node without loads yet is not the first one, which is of zeros
-                T8* const line = load + node;
-                *line = load_lines[(part_line + node) * touch[node]] + values;
-                touch[node] = 1;
+                own[node] = lines[(before + node) * touched[node]] + values;
+                touched[node] = 1;
             };
             add(node_i[l], rows[0][l]);
             add(node_i[l] + 1, rows[1][l]);
@@ -235,8 +240,8 @@ _LAW = """
             add(node_j[l] + 1, rows[3][l]);
             const long k = ks[l];
             if constexpr (HAS_FRICTION) {
-                __builtin_memcpy(kept_now + 4 * k, &memories[l], sizeof(T4));
-                written_now[k] = now;
+                __builtin_memcpy(memory_now + 4 * k, &memories[l], sizeof(T4));
+                step_now[k] = now;
             }
             if (keeps) {
                 auto lane = [&](const V& v) -> T { return ((const T*)&v)[l]; };

@@ -3,7 +3,8 @@
 A fiber whose rows are out of balance is visited: each of its rows whose fault is not small takes
 the force that balances it alone. That moves its two fibers at once, and both queue up to be visited
 again. So work is spent only where forces still change: after a warm start a row is looked at twice
-or thrice, where passes over all rows (`dual_rows`) repeat for the slowest cluster.
+or thrice, where passes over all rows (`dual_rows`) repeat for the slowest cluster. Cells of one
+part without friction: `native_row_coupling`.
 
 Many fibers are cut into parts, slabs of the cell across the axis along which fibers reach least.
 Parts relax their own rows side by side, then one thread all that are left, those between parts
@@ -25,10 +26,11 @@ from warpfiber.laws.repulsion import RANGE
 from warpfiber.model import precision
 from warpfiber.passes.dual_rows import BROKEN, NEXT_UPDATES, UNSOLVED
 from warpfiber.passes.native_friction import RUB_FORCES, RUB_NAMES, rubbing
+from warpfiber.passes.native_row_coupling import coupling_text
 from warpfiber.passes.native_row_order import BEGIN_TEXT, NAMES, ROWS_TEXT, named
 
 OVER = 1.2
-SHARE = 0.5
+SHARE, SHARE_RUBBING = 0.9, 0.5
 FINE = 0.02
 # stages of a solve; all but BEGIN and REST by as many threads as parts
 BEGIN, ROWS, PARTS, REST, END = range(5)
@@ -65,6 +67,7 @@ OPENING = {
 # The motion of the fibers of a part by the forces of all their rows, added up anew.
 # `push(f, r, side, change)` moves fiber f by a change of the force of row r.
 ADD_UP = """
+    auto add_up = [&]() {
     for (int q = d.part_start.data[part]; q < d.part_start.data[part + 1]; ++q) {
         const int f = d.fiber_order.data[q];
         T* const mine = motion + d.fiber_at.data[f];
@@ -74,6 +77,7 @@ ADD_UP = """
             if (rows[r].force != T(0)) push(f, r, side, rows[r].force);
 ADD_FRICTION        });
     }
+    };
 """
 
 # In PARTS the rows within a part, in REST all of them. `diagonal_of(r)`: D of a row.
@@ -268,19 +272,26 @@ def relaxation_text(
     rub_column of these fibers, where rows have friction.
     """
     real = {"float32": "float", "float64": "double"}[precision(name).name]
+    # a friction force that is not looked at again keeps the limit of an earlier normal force
+    share = SHARE if friction is None else SHARE_RUBBING
     numbers = f"""
     {types or f"typedef {real} T;"}
-    constexpr double over = {OVER!r}, share = {SHARE!r}, fine = {FINE!r};
+    constexpr double over = {OVER!r}, share = {share!r}, fine = {FINE!r};
     constexpr double broken = {BROKEN!r};
     constexpr double edge = {RANGE - 1.0!r};
     constexpr bool yields = {str(law != "hard").lower()};
     constexpr int next_updates = {NEXT_UPDATES}, unsolved = {UNSOLVED};
 """
+    coupled = "" if friction is not None else f"if (coupled) {{ {coupling_text()} }}"
     stages = f"""
     if (stage == {BEGIN}) {{ {BEGIN_TEXT} }}
     if (stage == {ROWS}) {{ {ROWS_TEXT} }}
-    if (stage != {REST}) {{ {ADD_UP} }}
+    {ADD_UP}
+    const bool coupled = {str(friction is None).lower()} && d.parts == 1;
+    if (stage == {REST} && coupled) return;
+    if (stage != {REST} && !coupled) add_up();
     if (stage == {END}) {{ {LEAVE} }}
+    {coupled}
     {RELAX}
 """
     begin, behind = NAMES + OPENING[law], ""

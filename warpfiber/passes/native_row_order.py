@@ -43,8 +43,12 @@ NAMES = """
     };
     // each row end of fiber f: its own rows, then those that it is the partner of
     auto each_end = [&](int f, auto look) {
-        for (int r = row_first(f); r < row_last(f); ++r) look(r, 0);
-        for (int k = d.in_start.data[f]; k < d.in_start.data[f + 1]; ++k) look(d.in_row.data[k], 1);
+        // read before anything is written, which might be any of them
+        const int first = row_first(f), last = row_last(f);
+        const int in_first = d.in_start.data[f], in_last = d.in_start.data[f + 1];
+        const int* const in_row = d.in_row.data;
+        for (int r = first; r < last; ++r) look(r, 0);
+        for (int k = in_first; k < in_last; ++k) look(in_row[k], 1);
     };
 """
 

@@ -107,13 +107,15 @@ class NeighborList:
         self._cut_into_pieces()
         domain, name = model.domain, model.precision.name
         has_pieces = self.piece_count > model.segment_count
+        # pairs a rounding of float32 too far are pruned, or cost an implicit step nothing
+        loose = flow_origin is not None or (slide_origin is not None and self.native)
         features = ListFeatures(
             domain.periodic,
             domain.shear_axes,
             domain.sheared,
             has_pieces,
             closed,
-            loose=flow_origin is not None and not has_pieces,
+            loose=loose and not has_pieces,
             slides=slide_origin is not None,
         )
         if self.native:

@@ -15,6 +15,7 @@ import warp as wp
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.native_friction import RUB_NUMBERS
 from warpfiber.passes.native_relaxation import BEGIN, END, PARTS, REST, ROWS
+from warpfiber.passes.native_row_coupling import HOT_NUMBERS, TOUCH_NUMBERS, TOUCHES
 from warpfiber.passes.native_row_order import ROW_NUMBERS, STATE_NUMBERS, STILL
 from warpfiber.passes.relaxation_work import relaxation_struct
 
@@ -63,6 +64,11 @@ def relaxation_work(
     work.fiber_order, work.part_start = zeros(fibers), zeros(parts + 2)
     work.part_relaxed = zeros(parts, wp.int64)
     work.fiber_queued, work.queue = zeros(fibers, wp.uint8), zeros(fibers)
+    alone = capacity if parts == 1 and rows.rub is None else 0
+    work.row_hot = zeros(HOT_NUMBERS * alone, p.real)
+    work.touches = wp.empty(TOUCHES * TOUCH_NUMBERS * alone, dtype=p.real, device=device)
+    work.touch_at, work.row_queue = zeros(2 * alone), zeros(alone)
+    work.row_queued = zeros(alone, wp.uint8)
     work.node_shift, work.node_push = dual.node_shift, dual.node_push
     work.best, work.control = dual.best, dual.control
     return work

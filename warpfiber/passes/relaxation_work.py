@@ -70,6 +70,12 @@ def relaxation_struct(name: str) -> Any:
         part_relaxed: wp.array(dtype=wp.int64)
         fiber_queued: wp.array(dtype=wp.uint8)
         queue: wp.array(dtype=wp.int32)
+        # what rows do to each other, and the queue of rows, where there is one part
+        row_hot: wp.array(dtype=real)
+        touches: wp.array(dtype=real)
+        touch_at: wp.array(dtype=wp.int32)
+        row_queued: wp.array(dtype=wp.uint8)
+        row_queue: wp.array(dtype=wp.int32)
         node_shift: wp.array(dtype=vec3)
         node_push: wp.array(dtype=vec3)  # forces on nodes, if they are asked for
         best: wp.array(dtype=wp.float64)

@@ -53,17 +53,22 @@ SET_FRICTION    };
         mine[0] += change * (move.middle - move.turn);
         mine[1] += change * (move.middle + move.turn);
     };
+    auto reply_of = move_by;
+    // along the normal of row q
+    auto felt = [&](const Move& move, int, int q, int end) -> T {
+        const T lever = T(2) * (end == 0 ? rows[q].s : rows[q].t) - T(1);
+        return dot(rows[q].normal, move.middle + lever * move.turn);
+    };
     auto diagonal_of = [&](int r) -> T {
         const int on[2] = {states[r].fiber_i, states[r].fiber_j};
         const int at[2] = {rows[r].at_i, rows[r].at_j};
-        const T levers[2] = {T(2) * rows[r].s - T(1), T(2) * rows[r].t - T(1)};
         T diagonal = T(0);
         for (int side = 0; side < 2; ++side) {
             if (at[side] == still) continue;
             const Move move = move_by(on[side], r, side);
             for (int end = 0; end < 2; ++end) {  // a rod may meet its own image
                 if (on[end] != on[side]) continue;
-                const T e = dot(rows[r].normal, move.middle + levers[end] * move.turn);
+                const T e = felt(move, on[side], r, end);
                 diagonal += end == 0 ? -e : e;
             }
         }

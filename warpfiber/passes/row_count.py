@@ -66,6 +66,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
     @wp.kernel(**options)
     def carry_rows(
         offset: wp.int32,
+        run: wp.int32,
         row_out_start: wp.array(dtype=wp.int32),
         row_j: wp.array(dtype=wp.int32),
         row_key: wp.array(dtype=wp.int32),
@@ -76,12 +77,14 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
         carried_key_out: wp.array(dtype=wp.int32),
         carried_force_out: wp.array(dtype=real),
     ):
+        """Rows of a run of segments lie behind each other."""
         if status[wp.static(HALT)] != 0:
             return
-        i = wp.tid() + offset
-        end = row_out_start[i + 1]
-        carried_start_out[i + 1] = end
-        for r in range(row_out_start[i], end):
+        first = (wp.tid() + offset) * run
+        last = wp.min(first + run, row_out_start.shape[0] - 1)
+        for i in range(first, last):
+            carried_start_out[i + 1] = row_out_start[i + 1]
+        for r in range(row_out_start[first], row_out_start[last]):
             carried_j_out[r] = row_j[r]
             carried_key_out[r] = row_key[r]
             carried_force_out[r] = row_force[r]
