@@ -159,9 +159,6 @@ def pushes(sim: Simulation) -> np.ndarray:
     count = sim.method.list.pair_count  # type: ignore[union-attr]
     acts = contacts.acts.numpy()[:count] != 0
     total: np.ndarray = contacts.force.numpy()[:count][acts].sum(axis=0)
-    total += contacts.beside.numpy()[contacts.pair_hit.numpy()[:count][acts]][:, :2].sum(
-        axis=(0, 1)
-    )
     return total
 
 

@@ -51,10 +51,9 @@ def plain_loads(sim: Any) -> tuple[np.ndarray, np.ndarray]:
         s, t = contacts.arms.numpy()[k][:2].astype(float)
         for at, part, on in zip(first, (s, t), (force, -force), strict=True):
             loads[at : at + 2] += np.array([[1.0 - part], [part]]) * on
-        rows = contacts.beside.numpy()[hits[k]].astype(float)
-        loads[first[0] : first[0] + 2] += rows[:2]
-        loads[first[1]] += rows[2]
-        loads[first[1] + 1] -= rows.sum(axis=0)
+        for at, couple in zip(first, contacts.beside.numpy()[2 * hits[k] :], strict=False):
+            loads[at] += couple
+            loads[at + 1] -= couple
     return loads, marks
 
 

@@ -119,8 +119,11 @@ def make_bond(name):
     @wp.func
     def bond_dashpots(c: vec4, d: vec3, dv: vec3, wi: vec3, wj: vec3):
         """Force and moment like those of `bond_loads`; dv = v_j - v_i."""
-        axis = wp.normalize(d)
+        by_square = one / wp.dot(d, d)
         slip = dv - half * wp.cross(wi + wj, d)
-        return split(slip, axis, c[0], c[1]), split(wj - wi, axis, c[3], c[2])
+        turn = wj - wi
+        along = (c[0] - c[1]) * by_square * wp.dot(slip, d)
+        twist = (c[3] - c[2]) * by_square * wp.dot(turn, d)
+        return c[1] * slip + along * d, c[2] * turn + twist * d
 
     return bond_loads, bond_energies, bond_dashpots

@@ -28,11 +28,11 @@ def make_capsule_contact(name):
     slender, power, steep = real(SLENDER), real(POWER), real(1.5 * SLENDER * POWER)
 
     @wp.func
-    def curvatures(ends: wp.int32, ra: real, rb: real, sine: real) -> vec2:
+    def curvatures(ends: wp.int32, ra: real, rb: real, sine2: real) -> vec2:
         """(m S, m^2 P); ends: 0 cylinders, 1 the end of a on b, 2 the end of b on a, 3 two ends."""
         total = ra + rb
         if ends == 0:
-            return vec2(total, ra * rb * sine * sine)
+            return vec2(total, ra * rb * sine2)
         if ends == 1:
             return vec2(rb + total, rb * total)
         if ends == 2:
@@ -40,8 +40,11 @@ def make_capsule_contact(name):
         return vec2(two * total, total * total)
 
     @wp.func
-    def hertz_factor(sp: vec2, m: real) -> vec2:
-        """f = sqrt(R*) F_2^-1.5, and d ln f / d ln P."""
+    def hertz_factor(sp: vec2) -> vec2:
+        """f = sqrt(R*) F_2^-1.5 times sqrt(P / k_a k_b), and d ln f / d ln P.
+
+        The root is the sine between two cylinders.
+        """
         difference = wp.sqrt(wp.max(sp[0] * sp[0] - four * sp[1], zero))
         # (S + D) / (S - D) without the difference of numbers that are nearly equal
         ratio = (sp[0] + difference) * (sp[0] + difference) / (four * sp[1])
@@ -55,6 +58,6 @@ def make_capsule_contact(name):
             more = lacking * (one + slope) * sp[0] / (slope * correction * difference)
             steepness -= steep * more
         cube = correction * correction * correction
-        return vec2(wp.sqrt(m / (wp.sqrt(sp[1]) * cube)), steepness)
+        return vec2(wp.sqrt(wp.sqrt(sp[1]) / cube), steepness)
 
     return curvatures, hertz_factor

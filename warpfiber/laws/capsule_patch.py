@@ -92,18 +92,16 @@ def make_capsule_patch(name):
         by_la: real,
         by_lb: real,
         reach: real,
-        rigidity: real,
-        steepness: real,
-        cosine: real,
+        weight: real,
         wider: real,
         by_ww: real,
         leading: real,
         forward: wp.bool,
     ):
-        """Of slices across e; forward: sigma = 1; rigidity = w E* f sine.
+        """Of slices across e, with E* f sine = 1; forward: sigma = 1.
 
-        by_la = 1 / la; by_lb = sigma / lb; steepness = -d ln (f sine) / d cosine / cosine; wider =
-        1 / (1 + cosine); by_ww = 1 / w^2; leading = d ln w / d cosine.
+        by_la = 1 / la; by_lb = sigma / lb; wider = 1 / (1 + cosine); by_ww = 1 / w^2; leading =
+        d ln weight / d cosine.
         """
         nothing = vec3(zero, zero, zero)
         e = along_a + along_b
@@ -144,7 +142,7 @@ def make_capsule_patch(name):
         by_wide = by_h * h
         by_root = wp.sqrt(by_wide)
         # y = 2 tan(angle / 2) times the way along the mean direction
-        rigid = rigidity * wp.sqrt(two * wider)
+        rigid = weight * wp.sqrt(two * wider)
         scale = half * rigid * by_wide * by_wide * by_root
         energy = scale * sums[0]
         stiffness = rigid * (x2 - x1) * by_root
@@ -176,8 +174,8 @@ def make_capsule_patch(name):
         stretched = wp.where(is_behind, further, wp.where(is_ahead, -further, zero)) * held
         by_length_a += stretched
         by_length_b = stretched + wp.where(forward, at_last, -at_first)
-        # angle: f, w and the way across
-        by_cosine = energy * (leading - half * wider - steepness * cosine)
+        # angle: weight and the way across
+        by_cosine = energy * (leading - half * wider)
         # slices turn with the mean direction: d0 stays across e
         turn = -wider * (wp.dot(whole, along_b) - at_first - at_last)
         by_delta = whole + turn * e

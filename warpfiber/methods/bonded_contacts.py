@@ -86,7 +86,7 @@ class BondedContacts:
         self.pair_hit = wp.zeros(size, dtype=wp.int32, device=device)  # of those that act
         # by hit, which lie beside each other
         self.moment = wp.zeros(size, dtype=p.vec3, device=device)
-        self.beside = wp.zeros(size, dtype=p.mat33, device=device)
+        self.beside = wp.zeros(2 * size, dtype=p.vec3, device=device)  # of i, of j
         self.hit_pair = wp.zeros(size, dtype=wp.int32, device=device)
         self.hit_closest = wp.zeros(size, dtype=p.vec2, device=device)
         self.hit_count = wp.zeros(part_count(size, str(device)), dtype=wp.int32, device=device)

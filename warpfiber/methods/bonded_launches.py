@@ -125,7 +125,7 @@ def bond_launch(spheres: BondedSpheres, *, drifts: bool, kicks: bool) -> Launch:
     none_i = wp.zeros(0, dtype=wp.int32, device=model.device)
     none_3 = wp.zeros(0, dtype=p.vec3, device=model.device)
     gathered: list[Any] = [*[none_i] * 5, none_3]
-    kinds = (p.vec4, wp.uint8, wp.int32, p.vec3, p.mat33, wp.int32, p.vec3, p.vec3)
+    kinds = (p.vec4, wp.uint8, wp.int32, p.vec3, p.vec3, wp.int32, p.vec3, p.vec3)
     gathered += [wp.zeros(0, dtype=kind, device=model.device) for kind in kinds]
     if spheres.contacts is not None:
         pairs, contacts = spheres.contacts.search.list, spheres.contacts

@@ -55,7 +55,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
     Without `kicks` too: only the accelerations of the start.
     """
     p = precision(name)
-    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     BondGroup = bond_group_struct(name)
     Node = node_struct(name)
     bond_loads, _, bond_dashpots = make_bond(name)
@@ -147,7 +147,7 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
         pair_acts: wp.array(dtype=wp.uint8),
         pair_hit: wp.array(dtype=wp.int32),
         hit_moment: wp.array(dtype=vec3),
-        hit_beside: wp.array(dtype=mat33),
+        hit_beside: wp.array(dtype=vec3),
         pair_acting: wp.array(dtype=wp.int32),
         contact_force: wp.array(dtype=vec3),
         contact_moment: wp.array(dtype=vec3),
@@ -225,6 +225,10 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 if not (length2 < torn2):  # not finite is torn too
                     torn = 1
 
+        by_inner_mass = one / g.mass
+        by_end_mass = one / g.end_mass
+        by_inner_inertia = one / g.inertia
+        by_end_inertia = one / g.end_inertia
         for i in range(first, last + 1):
             after = node
             force_after = last_force
@@ -251,11 +255,8 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 set_vector(contact_force, i, nothing)
                 set_vector(contact_moment, i, nothing)
 
-            mass = g.mass
-            inertia = g.inertia
-            if (i == first or i == last) and g.closed == 0:
-                mass = g.end_mass
-                inertia = g.end_inertia
+            is_end = (i == first or i == last) and g.closed == 0
+            mass = wp.where(is_end, g.end_mass, g.mass)
             if wp.static(has_grips):
                 if node_hold[i] >= wp.static(LOWER):
                     node_grip[i] = force
@@ -285,8 +286,10 @@ def make_bond_sweep(name: str, features: BondFeatures, drifts: bool, kicks: bool
                 hold = node_hold[i]
                 if hold == wp.static(FREE):
                     force += node_load[i]
-            rate = (one / mass) * force + g.weight - settling * node.v
-            spin_rate = (one / inertia) * moment - settling * node.w
+            by_mass = wp.where(is_end, by_end_mass, by_inner_mass)
+            by_inertia = wp.where(is_end, by_end_inertia, by_inner_inertia)
+            rate = by_mass * force + g.weight - settling * node.v
+            spin_rate = by_inertia * moment - settling * node.w
             v = node.v
             w = node.w
             if wp.static(kicks):

@@ -48,7 +48,6 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     vector, set_vector = make_items(vec3)
     pair_of, _ = make_items(vec2)
     _, set_four = make_items(vec4)
-    _, set_nine = make_items(mat33)
     _, set_flag = make_items(wp.uint8)
     fetch_place, fetch_vector = make_fetch(wp.vec3d, 2), make_fetch(vec3, 2)
 
@@ -116,7 +115,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         pair_arms_out: wp.array(dtype=vec4),
         pair_hit_out: wp.array(dtype=wp.int32),
         hit_moment_out: wp.array(dtype=vec3),
-        hit_beside_out: wp.array(dtype=mat33),
+        hit_beside_out: wp.array(dtype=vec3),
         pair_record_out: wp.array(dtype=vec4),
         pair_memory: wp.array2d(dtype=vec4),
         pair_step: wp.array2d(dtype=wp.int32),
@@ -196,8 +195,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                             last,
                             s,
                             t,
-                            wp.length(a),
-                            wp.length(b),
+                            wp.length(vec3(point(place, end_i) - point(place, node_i))),
+                            wp.length(vec3(point(place, end_j) - point(place, node_j))),
                             segment_beside(gi, i, at_i, s),
                             segment_beside(gj, j, at_j, t),
                             out_start,
@@ -217,7 +216,8 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             set_vector(pair_force_out, k, force - (size - push[0]) * n + springs)
             set_number(pair_hit_out, k, hit)
             set_vector(hit_moment_out, hit, wp.cross(n, force))
-            set_nine(hit_beside_out, hit, wp.matrix_from_rows(on_i, -on_i, on_j))
+            set_vector(hit_beside_out, 2 * hit, on_i)
+            set_vector(hit_beside_out, 2 * hit + 1, on_j)
             set_four(pair_arms_out, k, vec4(s, t, arm_i, arm_j))
             if wp.static(is_recorded):
                 first = wp.static(RECORD) * k
@@ -236,14 +236,13 @@ def make_gather(name: str, closed: bool):
     takes three times as long, most of it for ends of loops that no processor foresees.
     """
     p = precision(name)
-    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     one = real(1.0)
     number, set_number = make_items(wp.int32)
     vector, set_vector = make_items(vec3)
     four, _ = make_items(vec4)
-    nine, _ = make_items(mat33)
     flag, _ = make_items(wp.uint8)
-    fetch_vector, fetch_four, fetch_nine = make_fetch(vec3), make_fetch(vec4), make_fetch(mat33)
+    fetch_vector, fetch_two, fetch_four = make_fetch(vec3), make_fetch(vec3, 2), make_fetch(vec4)
 
     @wp.func
     def gather_pairs(
@@ -261,7 +260,7 @@ def make_gather(name: str, closed: bool):
         pair_acts: wp.array(dtype=wp.uint8),
         pair_hit: wp.array(dtype=wp.int32),
         hit_moment: wp.array(dtype=vec3),
-        hit_beside: wp.array(dtype=mat33),
+        hit_beside: wp.array(dtype=vec3),
         acting: wp.array(dtype=wp.int32),
         node_force: wp.array(dtype=vec3),
         node_moment: wp.array(dtype=vec3),
@@ -282,7 +281,7 @@ def make_gather(name: str, closed: bool):
             fetch_four(pair_arms, k)
             fetch_vector(pair_force, k)
             fetch_vector(hit_moment, number(pair_hit, k))
-            fetch_nine(hit_beside, number(pair_hit, k))
+            fetch_two(hit_beside, 2 * number(pair_hit, k))
             k = number(acting, slot)
             segment = number(pair_i, k)
             if slot >= incoming:
@@ -292,29 +291,23 @@ def make_gather(name: str, closed: bool):
             if wp.static(closed):
                 if node == last:
                     end = first
+            hit = number(pair_hit, k)
             arms = four(pair_arms, k)
             force = vector(pair_force, k)
             part = arms[0]
             arm = arms[2]
+            beside = 2 * hit
             if slot >= incoming:
                 force = -force
                 part = arms[1]
                 arm = arms[3]
-            moment = arm * vector(hit_moment, number(pair_hit, k))
-            set_vector(node_force, node, vector(node_force, node) + (one - part) * force)
-            set_vector(node_moment, node, vector(node_moment, node) + (one - part) * moment)
-            set_vector(node_force, end, vector(node_force, end) + part * force)
+                beside += 1
+            couple = vector(hit_beside, beside)  # one end feels its reverse
+            moment = arm * vector(hit_moment, hit)
+            rest = one - part
+            set_vector(node_force, node, vector(node_force, node) + (rest * force + couple))
+            set_vector(node_moment, node, vector(node_moment, node) + rest * moment)
+            set_vector(node_force, end, vector(node_force, end) + (part * force - couple))
             set_vector(node_moment, end, vector(node_moment, end) + part * moment)
-            beside = nine(hit_beside, number(pair_hit, k))
-            if slot < incoming:
-                set_vector(node_force, node, vector(node_force, node) + beside[0])
-                set_vector(node_force, end, vector(node_force, end) + beside[1])
-            else:
-                set_vector(node_force, node, vector(node_force, node) + beside[2])
-                set_vector(
-                    node_force,
-                    end,
-                    vector(node_force, end) - (beside[0] + beside[1] + beside[2]),
-                )
 
     return gather_pairs

@@ -38,10 +38,20 @@ def make_capsule_touch(name: str, closed: bool = False):
     curvatures, hertz_factor = make_capsule_contact(name)
     side_share, tip_share = make_capsule_patch(name)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
-    near, least_sine, both_ways = real(END_TOLERANCE[name]), real(SMALLEST_SINE), real(BOTH_WAYS)
-    turning, tiny = real(TURNING_SINE), real(1.0e-30)
+    near, least_sine2, both_ways = (
+        real(END_TOLERANCE[name]),
+        real(SMALLEST_SINE**2),
+        real(BOTH_WAYS),
+    )
+    turning2, tiny = real(TURNING_SINE**2), real(1.0e-30)
     parallel2 = real(PARALLEL[name] ** 2)
     two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
+
+    @wp.func
+    def tip_factor(ends: wp.int32, ra: real, rb: real) -> real:
+        """f of tips."""
+        sp = curvatures(ends, ra, rb, one)
+        return hertz_factor(sp)[0] * wp.sqrt(ra * rb / sp[1])
 
     @wp.func
     def is_tip(g: BondGroup, at: wp.int32, s: real) -> wp.bool:
@@ -66,7 +76,6 @@ def make_capsule_touch(name: str, closed: bool = False):
         """Of segments nearest at st, within reach there; gap from the point of i to that of j."""
         reach = gi.radius + gj.radius
         modulus = one / (gi.compliance + gj.compliance)
-        both_radii = gi.radius * gj.radius
         la = wp.length(a)
         lb = wp.length(b)
         by_both = one / (la * lb)
@@ -76,11 +85,13 @@ def make_capsule_touch(name: str, closed: bool = False):
         along_b = by_lb * b
         signed = wp.dot(along_a, along_b)
         cosine = wp.min(wp.abs(signed), one)
-        cross = wp.length(wp.cross(along_a, along_b))
-        sine = wp.max(cross, least_sine)
-        by_sine2 = one / (sine * sine)
-        form = hertz_factor(curvatures(0, gi.radius, gj.radius, sine), both_radii)
+        cross2 = wp.length_sq(wp.cross(along_a, along_b))
+        sine2 = wp.max(cross2, least_sine2)
+        form = hertz_factor(curvatures(0, gi.radius, gj.radius, sine2))
         rigidity = modulus * form[0]
+        # a wider angle stores less: d ln P = -2 cos d cos / sin^2
+        angle = wp.where(cross2 > turning2, signed / sine2, zero)
+        twist = -two * form[1] * angle
         inside = wp.min(wp.min(st[0], one - st[0]) * la, wp.min(st[1], one - st[1]) * lb)
         # half of the patch along either fiber is its root
         patch2 = reach * reach - wp.dot(gap, gap)
@@ -88,11 +99,10 @@ def make_capsule_touch(name: str, closed: bool = False):
         if inside2 > patch2 and inside > near * wp.max(la, lb):
             distance = wp.length(gap)
             depth = wp.max(reach - distance, zero)
-            stiffness = two * rigidity * wp.sqrt(depth)
+            stiffness = two * rigidity * wp.sqrt(depth / sine2)
             size = two_thirds * stiffness * depth
             energy = two_fifths * size * depth
-            # a wider angle stores less: d ln P = -2 cos d cos / sin^2
-            twist = wp.where(cross > turning, -two * form[1] * energy * signed * by_sine2, zero)
+            twist *= energy
             n = (one / distance) * gap
             return (
                 vec4(size, stiffness, st[0], st[1]),
@@ -103,6 +113,7 @@ def make_capsule_touch(name: str, closed: bool = False):
                 (twist * by_lb) * (along_a - signed * along_b),
             )
 
+        twist -= angle  # of the way across
         energy = zero
         stiffness = zero
         damped = zero
@@ -113,7 +124,6 @@ def make_capsule_touch(name: str, closed: bool = False):
         by_a = vec3(zero, zero, zero)
         by_b = vec3(zero, zero, zero)
         forward = signed >= zero
-        along = cosine
         across_b = wp.where(forward, one, -one) * along_b
         w = across_b - along_a
         # 1 / (1 + cosine), 1 / w^2; slices the other way have e and w in each other's place
@@ -121,8 +131,6 @@ def make_capsule_touch(name: str, closed: bool = False):
         by_ends = one / ((one + cosine) * ww)
         wider = by_ends * ww
         by_ww = by_ends * (one + cosine)
-        steepness = wp.where(cross > turning, (two * form[1] + one) * by_sine2, zero)
-        rigidity *= sine
         ways = wp.where(cosine >= both_ways, 1, 2)
         weight = wp.where(ways == 1, one, half + cosine)
         for way in range(ways):
@@ -139,9 +147,7 @@ def make_capsule_touch(name: str, closed: bool = False):
                 by_la,
                 sigma * by_lb,
                 reach,
-                weight * rigidity,
-                steepness,
-                along,
+                weight,
                 wider,
                 by_ww,
                 leading,
@@ -160,11 +166,17 @@ def make_capsule_touch(name: str, closed: bool = False):
             by_a += by_i
             by_b += by_j
             forward = not forward
-            along = -along
             weight = wp.max(one - weight, tiny)
             before = wider
             wider = two * by_ww
             by_ww = half * before
+        energy *= rigidity
+        stiffness *= rigidity
+        damped *= rigidity
+        twist *= energy
+        by_delta *= rigidity
+        by_a = rigidity * by_a + (twist * by_la) * (along_b - signed * along_a)
+        by_b = rigidity * by_b + (twist * by_lb) * (along_a - signed * along_b)
 
         is_tip_i = is_tip(gi, at_i, st[0])
         is_tip_j = is_tip(gj, at_j, st[1])
@@ -172,10 +184,8 @@ def make_capsule_touch(name: str, closed: bool = False):
             tip_s = wp.where(st[0] < half, zero, one)
             tip_t = wp.where(st[1] < half, zero, one)
             if is_tip_i:
-                round = (
-                    modulus * hertz_factor(curvatures(1, gi.radius, gj.radius, one), both_radii)[0]
-                )
-                start = delta - tip_s * a
+                round = modulus * tip_factor(1, gi.radius, gj.radius)
+                start = delta - (tip_s * la) * along_a
                 e_tip, k_tip, d_tip, t_tip, deep_tip, by_d, by_j = tip_share(
                     start, along_b, lb, reach, round
                 )
@@ -190,10 +200,8 @@ def make_capsule_touch(name: str, closed: bool = False):
                     by_a = -tip_s * by_d
                     by_b = by_j
             if is_tip_j:
-                round = (
-                    modulus * hertz_factor(curvatures(2, gi.radius, gj.radius, one), both_radii)[0]
-                )
-                start = -delta - tip_t * b
+                round = modulus * tip_factor(2, gi.radius, gj.radius)
+                start = -delta - (tip_t * lb) * along_b
                 e_tip, k_tip, d_tip, s_tip, deep_tip, by_d, by_i = tip_share(
                     start, along_a, la, reach, round
                 )
@@ -208,12 +216,10 @@ def make_capsule_touch(name: str, closed: bool = False):
                     by_a = by_i
                     by_b = -tip_t * by_d
             if is_tip_i and is_tip_j:
-                c = delta + tip_t * b - tip_s * a
+                c = delta + (tip_t * lb) * along_b - (tip_s * la) * along_a
                 apart = wp.length(c)
                 deep_tip = wp.max(reach - apart, zero)
-                round = (
-                    modulus * hertz_factor(curvatures(3, gi.radius, gj.radius, one), both_radii)[0]
-                )
+                round = modulus * tip_factor(3, gi.radius, gj.radius)
                 k_tip = two * round * wp.sqrt(deep_tip)
                 push = two_thirds * k_tip * deep_tip
                 if two_fifths * push * deep_tip > energy:
@@ -227,7 +233,7 @@ def make_capsule_touch(name: str, closed: bool = False):
                     by_a = -tip_s * by_delta
                     by_b = tip_t * by_delta
 
-        between = delta + t * b - s * a
+        between = delta + (t * lb) * along_b - (s * la) * along_a
         apart = wp.length(between)
         n = (one / apart) * between
         return (
