@@ -17,9 +17,9 @@ Symbols: b = r_a + r_b, a and b edges, delta from start to start, D(u) = d_0 + u
 Limits: sin(angle) is taken as 0.02 at least, where c = 1.17 instead of 1 of parallel cylinders;
     from there to 0.03 the energy changes with the angle without a moment. Where a patch reaches far
     into other segments these take another slice for the deepest one: second order in overlap /
-    radius. Across a bend in the plane of D slices of neighbors leave out (outside) or share (inside)
-    a wedge: at a node that bends by 14 degrees the force is 0.5 to 1.8 times that between nodes,
-    0.9 and 1.2 times on average along a segment; beside that plane it is 1.01 times.
+    radius. Across a bend in the plane of D slices of neighbors leave out a wedge (outside) or
+    share one (inside): at a node that bends by 14 degrees the force is 0.5 to 1.8 times that
+    between nodes, 0.9 and 1.2 times on average along a segment; beside that plane 1.01 times.
 """
 
 from functools import cache
