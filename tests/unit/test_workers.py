@@ -44,6 +44,17 @@ def _count_down(going: wp.array(dtype=wp.int32), rounds: wp.array(dtype=wp.int32
 
 
 @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+def _late(offset: wp.int32, found: wp.array(dtype=wp.float64)) -> None:
+    """found[i] += 1, the last item after some ms that no compiler can leave out."""
+    i = wp.tid() + offset
+    x = wp.float64(0.0)
+    if i == found.shape[0] - 1:
+        for k in range(3000000):
+            x = wp.sqrt(x + wp.float64(k))
+    found[i] = found[i] + wp.where(x > wp.float64(1e9), wp.float64(2.0), wp.float64(1.0))
+
+
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False)
 def _begin(going: wp.array(dtype=wp.int32), most: wp.int32) -> None:
     going[0] = most
 
@@ -75,6 +86,23 @@ def test_meet(workers: int, steps: int) -> None:
     executor.run(steps, lambda: False)
     executor.close()
     np.testing.assert_array_equal(a.numpy(), _expected(start, 2 * steps))
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_the_caller_waits_for_the_last(workers: int) -> None:
+    """A replay is over when the slowest worker is done, also without a barrier at its end."""
+    found = wp.zeros(ITEMS, dtype=wp.float64, device="cpu")
+    ends = np.linspace(0, ITEMS, workers + 1).astype(int)
+    graphs = []
+    for first, last in zip(ends[:-1], ends[1:], strict=True):
+        with wp.ScopedCapture(device="cpu") as capture:
+            wp.launch(_late, dim=last - first, inputs=[first, found], device="cpu")
+        graphs.append(capture.graph)
+    crew = room.Workers({1: graphs}, workers)
+    for steps in range(1, 4):
+        crew.run(1, lambda: False)
+        np.testing.assert_array_equal(found.numpy(), float(steps))
+    crew.close()
 
 
 def test_loop() -> None:
