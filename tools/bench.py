@@ -13,7 +13,7 @@
     python tools/bench.py plate [PART ...]        the sliding-plate cell: error of A against time
     options: --fibers N ..., --precisions P ..., --strain-step G, --seeds N, --strain S, --device D,
     --workers W ... (engine, beads: several alternate, with their ratio), --repeats N, --method M,
-    --shuffled (engine: large cells numbered in no order),
+    --shuffled (engine: fibers numbered in no order),
     --dry (print, do not write)
 
 A row has a time and an error; a run that is not finite is not timed. Times of this or that machine
@@ -101,7 +101,7 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     The density is chosen so that half the stable step is the asked strain per step. Large cells are
     made of periodic copies of one with a few thousand fibers, which are numbered copy by copy;
-    with `--shuffled` in no order, as fibers placed at random are.
+    with `--shuffled` in no order.
     """
     for precision in args.precisions:
         for fibers in args.fibers:
@@ -130,9 +130,9 @@ def engine(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 overrides["fibers.0.count"] = fibers // tiles**3
                 part = wf.load_scene(SCENES / "shear_cell.toml", overrides)
                 placement = tiled(place_fibers(part), tiles, edge / tiles)
-            order = "copies" if tiles > 1 else "random"
-            if placement is not None and args.shuffled:
-                placement, order = shuffled(placement), "random"
+            order = "copies" if tiles > 1 else "place"
+            if args.shuffled:
+                placement, order = shuffled(placement or place_fibers(scene)), "random"
             for row in cell_speeds(scene, args, placement):
                 yield row | {"bench": "engine", "numbering": order}
 
@@ -363,7 +363,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1])
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--set", action="append", default=[], type=_override)
-    parser.add_argument("--shuffled", action="store_true", help="number large cells at random")
+    parser.add_argument("--shuffled", action="store_true", help="number fibers at random")
     parser.add_argument("--dry", action="store_true", help="print only")
     args = parser.parse_intermixed_args()
     args.worker_counts, args.workers = args.workers, args.workers[0]

@@ -124,12 +124,21 @@ def test_space_order_keeps_neighbors_together() -> None:
     """64 cells of 4 x 4 x 4: every one, and every block of 8 of them, is a run of the order."""
     rng = np.random.default_rng(3)
     center = rng.random((5000, 3)) * 4.0
-    center[0] = 0.0  # cells begin at the lowest point
+    center[0], center[1] = 0.0, 4.0 - 1e-12  # cells go from the lowest point to the highest
     order = space_order(center, 1.0)
     assert (np.sort(order) == np.arange(len(center))).all()
     for width, cells in ((1.0, 64), (2.0, 8)):
         cell = np.floor(center[order] / width).astype(int) @ [1, 10, 100]
         assert np.count_nonzero(np.diff(cell)) == cells - 1
+
+
+def test_space_order_halves_the_longest_edge() -> None:
+    """Two workers, each with half of the numbers, meet where the box is cut and nowhere else."""
+    center = np.random.default_rng(4).random((4000, 3)) * (1.0, 3.0, 0.0)
+    along = center[space_order(center, 0.25), 1]
+    below = along < 0.5 * (along.min() + along.max())
+    assert np.count_nonzero(np.diff(below)) == 1
+    assert abs(np.count_nonzero(below) - 2000) < 5 * np.sqrt(1000)  # five deviations of a half
 
 
 def test_large_groups_are_sorted() -> None:

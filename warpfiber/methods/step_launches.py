@@ -108,7 +108,9 @@ def pair_launch(chain: BeadChain) -> Launch:
     if chain.native:
         kernel = make_native_pair_sweep(p.name, chain.pair_features)
         chunks = native_chunks(model.segment_count)
-        return Launch("pairs", kernel, chunks, [chunks, _ahead(chain), *inputs], split=True)
+        return Launch(
+            "pairs", kernel, chunks, [chunks, _ahead(chain), *inputs], split=True, stolen=True
+        )
     kernel = make_pair_sweep(p.name, chain.pair_features)
     return Launch("pairs", kernel, pairs.pair_capacity, inputs, split=True)
 
@@ -170,7 +172,7 @@ def native_node_launch(chain: BeadChain) -> Launch:
         wp.array(own, dtype=wp.int32, device=model.device),
     ]
     sweep = make_native_node_sweep(name, node_features(chain), _node_module(chain))
-    return Launch("nodes", sweep, len(own), inputs, split=True)
+    return Launch("nodes", sweep, len(own), inputs, split=True, stolen=True)
 
 
 def _node_inputs(chain: BeadChain) -> list[Any]:

@@ -15,10 +15,12 @@ import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import warp as wp
 
+from warpfiber.passes.work_stealing import StolenLaunch, stealing_kernel
 from warpfiber.passes.workers import Barrier, Workers, crew_kernels, meet_kernel
 
 COMPILERS = min(os.cpu_count() or 1, 4)  # at a time; each takes some hundred MB
@@ -41,7 +43,8 @@ class Launch:
     """One kernel over `dim` items; `split` kernels take the offset of their first item first.
 
     One that `follows` needs from the launch before only what the same worker made of it, so no
-    worker waits in between.
+    worker waits in between. `stolen`: long enough that workers take portions from one another; it
+    neither follows nor is followed.
     """
 
     name: str
@@ -50,6 +53,7 @@ class Launch:
     inputs: list[Any]
     split: bool = False
     follows: bool = False
+    stolen: bool = False
 
     def part(self, worker: int, workers: int) -> tuple[int, int]:
         """First item and number of items of one worker."""
@@ -60,7 +64,10 @@ class Launch:
 
     def run(self, device: str, worker: int = 0, workers: int = 1) -> None:
         """Launch this worker's part."""
-        begin, count = self.part(worker, workers)
+        self.run_items(device, *self.part(worker, workers))
+
+    def run_items(self, device: str, begin: int, count: int) -> None:
+        """Launch `count` items from `begin` on."""
         if count == 0:
             return
         inputs = [begin, *self.inputs] if self.split else self.inputs
@@ -170,10 +177,14 @@ class Executor:
         work = sum(launch.dim for launch in self.launches)
         self.batches = work < BATCH_BELOW or not device.startswith("cpu")
         self._pool: Workers | None = None
+        self._stolen: dict[int, StolenLaunch] = {}
         self._apart: list[tuple[list[Any], Launch | Call | Repeat]] = []
         if self.workers > 1:
-            load_kernels([*crew_kernels(), meet_kernel()], device)
+            stolen = [x for x in self.launches if isinstance(x, Launch) and x.stolen]
+            needed = [*crew_kernels(), meet_kernel(), *([stealing_kernel()] if stolen else [])]
+            load_kernels(needed, device)
             self._barrier = Barrier(self.workers)
+            self._stolen = {id(launch): self._portions(launch) for launch in stolen}
             # all before the threads start: nothing may be launched during a capture
             sizes = [1] if single else [1, WORKER_BATCH]
             graphs = {
@@ -184,6 +195,9 @@ class Executor:
         else:
             self._single = self._capture_steps(1)
             self._batch: Any = None
+
+    def _portions(self, launch: Launch) -> StolenLaunch:
+        return StolenLaunch(launch.dim, self.workers, partial(launch.run_items, self.device))
 
     def _capture_steps(self, steps: int) -> Any:
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
@@ -212,7 +226,10 @@ class Executor:
             if isinstance(item, Repeat):
                 self._record_loop(item, worker, look)
                 continue
-            item.run(self.device, worker, self.workers)
+            if id(item) in self._stolen:
+                self._stolen[id(item)].record(worker)
+            else:
+                item.run(self.device, worker, self.workers)
             if look is not None:
                 look(item.name)
             behind = items[k + 1] if k + 1 < len(items) else None
@@ -245,6 +262,8 @@ class Executor:
         """Replay up to `steps` steps, looking at `halted` after every graph."""
         if self._pool is not None:
             self._pool.run(steps, halted)
+            if any(stolen.failed[0] for stolen in self._stolen.values()):
+                raise RuntimeError("a captured portion of a step could not be replayed")
             return
         batch = BATCH if self.batches else 1
         while steps > 0 and not halted():

@@ -54,7 +54,8 @@ SWEEPS = 6000
 DIRECTION_DRAWS = 500
 """Directions tried for a fiber with a given center that another one is in the way of."""
 SORTED_FROM = 10_000
-"""Fibers of a group from which on neighbors get neighboring numbers: a cache then holds them."""
+"""Segments of a group from which on neighbors get neighboring numbers: a cache then holds them, and
+of two workers, each with a run of numbers, one rarely needs what the other wrote."""
 FILE_OVERLAP = 0.2
 """Deepest overlap accepted in a node file (radii); a penalty of decay 50 is then 150 D_0."""
 
@@ -309,8 +310,8 @@ class _Packing:
         counts: list[int] = []
         owner: list[int] = []
         for g in self.groups:
-            if g.given is None and len(g.center) >= SORTED_FROM:
-                order = space_order(g.center, 2.0 * g.half)
+            if g.given is None and len(g.center) * g.segments >= SORTED_FROM:
+                order = space_order(g.center, 0.5 * g.half)
                 g.center, g.direction = g.center[order], g.direction[order]
             chains = g.nodes or list(
                 straight_nodes(g.center, g.direction, 2.0 * g.half, g.segments)
@@ -338,12 +339,20 @@ class _Packing:
 
 
 def space_order(center: Floats, width: float) -> Ints:
-    """Order of points (n, 3) m along a Z-order curve through cells of this width (m), (n,)."""
-    cell = np.floor((center - center.min(axis=0)) / width).astype(np.int64)
+    """Order of points (n, 3) m along a Z-order curve through cells of about this width (m), (n,).
+
+    Cells are the box of the points, halved again and again along its longest edges: the first half
+    of the points lies beside the second one.
+    """
+    extent = np.ptp(center, axis=0)
+    halvings = np.ceil(np.log2(np.maximum(extent / width, 1.0))).astype(np.int64)
+    cells = 2**halvings
+    place = (center - center.min(axis=0)) / np.where(extent > 0.0, extent, 1.0)
+    cell = np.minimum((place * cells).astype(np.int64), cells - 1)
     key = np.zeros(len(center), dtype=np.int64)
-    for bit in range(20):
-        for axis in range(3):
-            key |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    for bit in reversed(range(int(halvings.max()))):
+        for axis in np.flatnonzero(halvings > bit)[::-1]:
+            key = 2 * key + (cell[:, axis] >> bit & 1)
     return np.argsort(key, kind="stable")
 
 
