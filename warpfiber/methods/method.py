@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -32,6 +33,7 @@ from warpfiber.passes.measurement import measure_fiber_terms
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pairs import PairFeatures
+from warpfiber.passes.worker_choice import WorkerChoice
 from warpfiber.scene import Scene, Stage
 
 # Below this many segments the hand-off between workers costs more than it saves.
@@ -51,6 +53,9 @@ class Method(ABC):
         self.scene, self.model, self.state = scene, model, state
         self.dt = dt / model.units.time
         self.workers = self._choose_workers(workers)
+        # a number that was asked for holds for every step
+        chosen = workers is None and self.workers > 1
+        self.worker_choice = WorkerChoice() if chosen else None
         units = model.units
         self.flow_rate = scene.flow.rate * units.time if scene.flow else 0.0
         self.flow_origin = np.zeros(3)
@@ -110,11 +115,15 @@ class Method(ABC):
 
         `measuring`: further kernels of the run, compiled along with these.
         """
+        if self.list is not None:
+            self.list.worker_choice = self.worker_choice
         if self.executor is None:
             launches = self.launches()
             stepping = [launch.kernel for launch in flat(launches) if isinstance(launch, Launch)]
             load_kernels([*stepping, *measuring], self.model.device)
-            self.executor = Executor(launches, self.model.device, self.workers)
+            self.executor = Executor(
+                launches, self.model.device, self.workers, choice=self.worker_choice
+            )
 
     def advance(self, steps: int) -> bool:
         """Run up to `steps` steps, doing what halts them; False if a fiber tore."""
@@ -122,8 +131,12 @@ class Method(ABC):
         while self.step_count < target:
             self.prepare()
             assert self.executor is not None
-            self.executor.run(target - self.step_count, self._halted)
-            if not self._settle():
+            begin, before = time.perf_counter(), self.step_count
+            self.executor.run(target - before, self._halted)
+            lasts = self._settle()
+            if self.worker_choice is not None:
+                self.worker_choice.note(self.step_count - before, time.perf_counter() - begin)
+            if not lasts:
                 return False
         return True
 

@@ -175,4 +175,5 @@ class NativeBonds:
         if spheres.energies.told:
             middle = [self.pair_launch(dt), *end[1:], *begin]
         device, status = spheres.model.device, spheres.state.status
-        return JoinedSteps(begin, middle, end, device, spheres.workers, status)
+        choice = spheres.worker_choice
+        return JoinedSteps(begin, middle, end, device, spheres.workers, status, choice)

@@ -76,8 +76,10 @@ class NearPairs:
     def _run(self, which: int) -> None:
         if not self._executors:
             workers, device = self.spheres.workers, self.spheres.model.device
+            choice = self.spheres.worker_choice
             self._executors = [
-                Executor([launch], device, workers, single=True) for launch in self.launches()
+                Executor([launch], device, workers, single=True, choice=choice)
+                for launch in self.launches()
             ]
         self._executors[which].run(1, _never)
 

@@ -3,8 +3,9 @@
 A step is a list of launches, each over an index range, some of which repeat until they say that
 they are done. A whole step (and a batch of steps) is one graph, on CPU and CUDA alike. Warp itself
 runs kernels serially on the CPU: with more workers (CPU only) each has a graph of its own, over its
-part of every range, and they meet after every launch. No kernel writes where another index reads,
-so the result is the same to the last bit for any number of workers.
+part of every range or over portions that they take from one another, and they meet after every
+launch. No kernel writes where another index reads, so the result is the same to the last bit for
+any number of workers.
 
 Limits: nothing may be launched from another thread during a capture (Warp's recording is global).
 """
@@ -21,6 +22,7 @@ from typing import Any
 import warp as wp
 
 from warpfiber.passes.work_stealing import StolenLaunch, stealing_kernel
+from warpfiber.passes.worker_choice import WorkerChoice
 from warpfiber.passes.workers import Barrier, Workers, crew_kernels, meet_kernel
 
 COMPILERS = min(os.cpu_count() or 1, 4)  # at a time; each takes some hundred MB
@@ -157,7 +159,8 @@ def median_times(steps: Sequence[StepTimes]) -> dict[str, float]:
 class Executor:
     """Replays the steps made of `items`; `launches` are all of them, repeated or not.
 
-    `single`: they are replayed once at a time, so no batch of steps is captured.
+    `single`: they are replayed once at a time, so no batch of steps is captured; `choice`: asked
+    before steps whether all workers take them or the first one alone, without it all do.
     """
 
     def __init__(
@@ -167,7 +170,9 @@ class Executor:
         workers: int = 1,
         *,
         single: bool = False,
+        choice: WorkerChoice | None = None,
     ) -> None:
+        self.choice = choice
         self.items = [item for item in items if isinstance(item, Repeat) or item.dim > 0]
         self.launches = flat(items)
         self.device = device
@@ -177,6 +182,8 @@ class Executor:
         work = sum(launch.dim for launch in self.launches)
         self.batches = work < BATCH_BELOW or not device.startswith("cpu")
         self._pool: Workers | None = None
+        self._single: Any = None
+        self._batch: Any = None
         self._stolen: dict[int, StolenLaunch] = {}
         self._apart: list[tuple[list[Any], Launch | Call | Repeat]] = []
         if self.workers > 1:
@@ -194,7 +201,6 @@ class Executor:
             self._pool = Workers(graphs, self.workers)
         else:
             self._single = self._capture_steps(1)
-            self._batch: Any = None
 
     def _portions(self, launch: Launch) -> StolenLaunch:
         return StolenLaunch(launch.dim, self.workers, partial(launch.run_items, self.device))
@@ -260,11 +266,13 @@ class Executor:
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
         """Replay up to `steps` steps, looking at `halted` after every graph."""
-        if self._pool is not None:
+        if self._pool is not None and (self.choice is None or self.choice.shared):
             self._pool.run(steps, halted)
             if any(stolen.failed[0] for stolen in self._stolen.values()):
                 raise RuntimeError("a captured portion of a step could not be replayed")
             return
+        if self._single is None:
+            self._single = self._capture_steps(1)
         batch = BATCH if self.batches else 1
         while steps > 0 and not halted():
             if steps < batch or batch == 1:

@@ -20,6 +20,7 @@ import warp as wp
 from warpfiber.model import EXPIRED, HALT, TORN
 from warpfiber.passes.executor import Call, Executor, Launch, Repeat, StepTimes
 from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.worker_choice import WorkerChoice
 
 Items = Sequence[Launch | Call | Repeat]
 
@@ -45,14 +46,21 @@ class JoinedSteps(Executor):
     """Replays steps cut into `begin`, `middle` and `end`; `status` are the words of the state."""
 
     def __init__(
-        self, begin: Items, middle: Items, end: Items, device: str, workers: int, status: Any
+        self,
+        begin: Items,
+        middle: Items,
+        end: Items,
+        device: str,
+        workers: int,
+        status: Any,
+        choice: WorkerChoice | None = None,
     ) -> None:
         gates = make_gates(kernel_module("gates"))
         shut, opened = (Launch("gate", kernel, 1, [status]) for kernel in gates)
-        super().__init__([*middle, shut], device, workers)
+        super().__init__([*middle, shut], device, workers, choice=choice)
         self.status = status
-        self.begin = Executor([*begin, shut], device, workers, single=True)
-        self.end = Executor([opened, *end], device, workers, single=True)
+        self.begin = Executor([*begin, shut], device, workers, single=True, choice=choice)
+        self.end = Executor([opened, *end], device, workers, single=True, choice=choice)
 
     def run(self, steps: int, halted: Callable[[], bool]) -> None:
         """Take up to `steps` steps, the last one to its end, looking at `halted` after graphs."""

@@ -48,6 +48,7 @@ from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.pieces import piece_counts
 from warpfiber.passes.pruning import Pruning
 from warpfiber.passes.rows import make_row_kernels
+from warpfiber.passes.worker_choice import WorkerChoice
 
 FIRST_STRETCH = 1.05  # rest lengths that a segment may have before the cells are widened
 START_ROOM = 1.02  # for segments that are longer than that from the start
@@ -95,6 +96,7 @@ class NeighborList:
         self.stretch_allowed = max(FIRST_STRETCH, START_ROOM * stretch)
         self.row_capacity = row_capacity
         self.workers = workers
+        self.worker_choice: WorkerChoice | None = None
         closed = len(model.segment_end) > 0
         self.native = model.device.startswith("cpu") if native is None else native
         self.native = self.native and not closed  # vectors know open fibers alone
@@ -329,7 +331,9 @@ class NeighborList:
                 self.wraps.fill_(self._wraps)
             if self._executor is None:
                 launches, device = list_launches(self), self.model.device
-                self._executor = Executor(launches, device, self.workers, single=True)
+                self._executor = Executor(
+                    launches, device, self.workers, single=True, choice=self.worker_choice
+                )
             self._executor.run(1, _never)
             status = host_view(self.state.status)
             overflow, stretched = int(status[OVERFLOW]), bool(status[STRETCHED])

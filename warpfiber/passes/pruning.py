@@ -127,7 +127,9 @@ class Pruning:
         while True:
             if self._executor is None:
                 launches, device = self._launches(), pairs.model.device
-                self._executor = Executor(launches, device, pairs.workers, single=True)
+                self._executor = Executor(
+                    launches, device, pairs.workers, single=True, choice=pairs.worker_choice
+                )
             self._executor.run(1, _never)
             if pairs.native or pairs.pair_count <= self.room:
                 break
