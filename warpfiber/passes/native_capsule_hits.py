@@ -21,8 +21,7 @@ SWEEP = """
         typedef Tipped Tips;
     };
     auto fetch = [](const void* from) { __builtin_prefetch(from, 0, 2); };
-    // laws of one kind in a row stay in the cache of instructions
-    constexpr int RUN = 6 * W, ROOM = RUN + W, KINDS = 4;
+    constexpr int ROOM = RUN + W, KINDS = 4;
     int hit_at[KINDS * ROOM], hits_of[KINDS] = {0, 0, 0, 0};
     T hit_s[KINDS * ROOM], hit_t[KINDS * ROOM];
     auto run = [&](auto kind, int from, int& hits) {

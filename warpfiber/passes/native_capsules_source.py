@@ -22,6 +22,7 @@ LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
 AHEAD = 4  # blocks of pairs whose nodes are fetched
+RUNS = 6  # laws of one kind in a row: they stay in the cache of instructions
 FAR = 16  # the same of the list itself
 READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 KEEPS_LOADS, KEEPS_RECORD = 1, 2  # what is stored by pair; see `contact_losses`
@@ -42,6 +43,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
         "TIP_BITS": TIP_BITS,
         "AHEAD": AHEAD,
         "FAR": FAR,
+        "RUN": RUNS * LANES,
         "SLOT_HALT": HALT,
         "KEEPS_LOADS": KEEPS_LOADS,
         "KEEPS_RECORD": KEEPS_RECORD,
