@@ -14,8 +14,10 @@ import pytest
 from tests.bonded_crowd import RADIUS, crowd
 from tests.unit.test_native_bonds import PAIR_BOUND
 from warpfiber.methods.bonded_launches import pair_launches
+from warpfiber.passes import native_capsules_source
 from warpfiber.passes.executor import load_kernels
-from warpfiber.passes.native_capsules_source import LINE, PARTS
+from warpfiber.passes.native_capsules import make_native_capsule_pairs
+from warpfiber.passes.native_capsules_source import LANES, LINE, PARTS, RUNS
 
 
 def kinked(precision: str, seed: int) -> Any:
@@ -80,3 +82,28 @@ def test_loads(precision: str, seed: int) -> None:
     found = vector_loads(sim)
     assert np.abs(found - expected).max() < PAIR_BOUND[precision] * np.abs(expected).max()
     sim.close()
+
+
+@pytest.mark.parametrize("precision", PAIR_BOUND)
+def test_laws_in_a_row(precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a pair does is the same bits whichever pairs wait for their law with it."""
+    found = []
+    for runs in (RUNS, 1):
+        monkeypatch.setattr(native_capsules_source, "RUNS", runs)
+        make_native_capsule_pairs.cache_clear()
+        sim = kinked(precision, 1)
+        loads = vector_loads(sim)
+        contacts, native = sim.method.contacts, sim.method.native
+        native.pair_launch(sim.method.dt, keeps=True).run("cpu")
+        acts = contacts.acts.numpy().astype(bool)
+        pairs = [array.numpy()[..., acts, :] for array in (contacts.force, contacts.arms)]
+        found.append((loads, acts, *pairs, contacts.memory.numpy()[:, acts]))
+        sim.close()
+    make_native_capsule_pairs.cache_clear()
+    # of four kinds: one at least that did not wait for the end of its part
+    assert found[0][1].sum() > PARTS * 4 * LANES
+    for loads, *pairs in found[1:]:
+        eps = np.finfo(precision).eps
+        assert np.abs(loads - found[0][0]).max() < 64.0 * eps * np.abs(loads).max()
+        for one, other in zip(pairs, found[0][1:], strict=True):
+            np.testing.assert_array_equal(one, other)

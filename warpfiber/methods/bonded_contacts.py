@@ -68,8 +68,12 @@ class BondedContacts:
         recorded = RECORD * size if self.features.recorded else 0
         self.record = wp.zeros(recorded, dtype=p.vec4, device=device)
         kept = size if self.features.friction else 0
-        self.memory = wp.zeros((2, kept), dtype=p.vec4, device=device)
-        self.written = wp.full((2, kept), NEVER, dtype=wp.int32, device=device)
+        # of even and odd steps, which a pair has beside each other where it runs in vectors
+        shape = (kept, 2) if self.vectors else (2, kept)
+        self.memory = wp.zeros(shape, dtype=p.vec4, device=device)
+        self.written = wp.full(shape, NEVER, dtype=wp.int32, device=device)
+        if self.vectors:
+            self.memory, self.written = self.memory.transpose(), self.written.transpose()
         segments = self.model.segment_count
         self.kept = [wp.zeros(segments, dtype=wp.int32, device=device) for _ in range(2)]
         self.kept += [wp.zeros(size, dtype=wp.int32, device=device) for _ in range(2)]

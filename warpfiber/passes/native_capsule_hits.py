@@ -21,26 +21,27 @@ SWEEP = """
         typedef Tipped Tips;
     };
     auto fetch = [](const void* from) { __builtin_prefetch(from, 0, 2); };
-    constexpr int ROOM = 2 * W, KINDS = 4;
+    constexpr int ROOM = RUN + W, KINDS = 4;
     int hit_at[KINDS * ROOM], hits_of[KINDS] = {0, 0, 0, 0};
     T hit_s[KINDS * ROOM], hit_t[KINDS * ROOM];
     auto run = [&](auto kind, int from, int& hits) {
-        law(kind, hit_at + from, hit_s + from, hit_t + from, W);
-        hits -= W;
+        for (int at = from; at < from + RUN; at += W)
+            law(kind, hit_at + at, hit_s + at, hit_t + at, W);
+        hits -= RUN;
         for (int l = from; l < from + hits; ++l) {
-            hit_at[l] = hit_at[W + l];
-            hit_s[l] = hit_s[W + l];
-            hit_t[l] = hit_t[W + l];
+            hit_at[l] = hit_at[RUN + l];
+            hit_s[l] = hit_s[RUN + l];
+            hit_t[l] = hit_t[RUN + l];
         }
     };
     auto run_rest = [&](auto kind, int from, int hits) {
-        if (hits == 0) return;
-        for (int l = from + hits; l < from + W; ++l) {
+        for (int l = from + hits; hits > 0 && l < from + hits + W; ++l) {
             hit_at[l] = hit_at[from];
             hit_s[l] = hit_s[from];
             hit_t[l] = hit_t[from];
         }
-        law(kind, hit_at + from, hit_s + from, hit_t + from, hits);
+        for (int at = from; hits > 0; at += W, hits -= W)
+            law(kind, hit_at + at, hit_s + at, hit_t + at, hits < W ? hits : W);
     };
     for (int first = begin; first < end; first += W) {
         const int count = end - first < W ? end - first : W;
@@ -96,16 +97,14 @@ SWEEP = """
             fetch(load + j);
             fetch(load + j + 1);
             if constexpr (HAS_FRICTION) {
-                fetch(written_last + k);
-                fetch(written_now + k);
-                fetch(kept_last + 4 * k);
-                fetch(kept_now + 4 * k);
+                fetch(pair_step + 2 * k);
+                fetch((const T*)pair_memory + 8 * k);
             }
         }
-        if (hits_of[0] >= W) run(Whole(), 0, hits_of[0]);
-        if (hits_of[1] >= W) run(OneWay(), ROOM, hits_of[1]);
-        if (hits_of[2] >= W) run(TwoWays(), 2 * ROOM, hits_of[2]);
-        if (hits_of[3] >= W) run(AtTips(), 3 * ROOM, hits_of[3]);
+        if (hits_of[0] >= RUN) run(Whole(), 0, hits_of[0]);
+        if (hits_of[1] >= RUN) run(OneWay(), ROOM, hits_of[1]);
+        if (hits_of[2] >= RUN) run(TwoWays(), 2 * ROOM, hits_of[2]);
+        if (hits_of[3] >= RUN) run(AtTips(), 3 * ROOM, hits_of[3]);
     }
     run_rest(Whole(), 0, hits_of[0]);
     run_rest(OneWay(), ROOM, hits_of[1]);

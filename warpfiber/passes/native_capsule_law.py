@@ -62,136 +62,130 @@ SHARES = """
         share.by_a = chosen(share.by_a, by.by_a);
         share.by_b = chosen(share.by_b, by.by_b);
     };
-    struct Slices { V u1, u2, width, part, at, o2, o, ou, ouu; };
-    // between low and high, of overlaps q - 2 slope x - vv x^2 at u_h + x; `at` their mean place
-    auto slices = [&](V q, V slope, V vv, V u_h, V low, V high, V length) -> Slices {
-        const V wide = root(larger(slope * slope + vv * q, V(T(0))));
-        const V sum = larger(wide + (slope < T(0) ? -slope : slope), V(SMALL));
-        const V bent = larger(vv, V(SMALL)), in_sum = T(1) / (sum * bent);
-        // overlaps end nearer to u_h on the side to which they fall there
-        const V there = q * bent * in_sum, back = larger(sum * sum * in_sum, there);
-        const V up = slope < T(0) ? back : there, down = slope < T(0) ? there : back;
-        Slices sums = {larger(low, u_h - down), smaller(high, u_h + up)};
-        const V width = sums.width = sums.u2 - sums.u1, mid = T(0.5) * (sums.u1 + sums.u2);
-        const V x = mid - u_h, o = q - (T(2) * slope + vv * x) * x;
-        const V fall = T(-2) * (slope + vv * x), w2 = width * width * T(1.0 / 12.0);
-        const V bow = vv * w2, along = width * w2 * fall;
-        sums.o = width * (o - bow);
-        sums.o2 = width * (o * (o - T(2) * bow) + fall * fall * w2 + T(1.8) * bow * bow);
-        sums.ou = mid * sums.o + along;
-        sums.ouu = mid * (sums.ou + along) + width * w2 * (o - T(1.8) * bow);
-        const V most = smaller(up + down, length), held = larger(sums.o, V(SMALL));
-        const V in_both = T(1) / (most * held);
-        sums.part = width * held * in_both;
-        sums.at = sums.ou * most * in_both;
-        return sums;
+    // integrals over x1 to x2 of overlaps o = q - 2 slope x - ww x^2
+    struct Slices { V o2, o, ox, oxx; };
+    auto overlap_at = [](V q, V slope, V ww, V x) -> V {
+        return q - (T(2) * slope + ww * x) * x;
     };
-    // what both ways across share; rigidity = E* f, steepness = d ln f / d ln P
+    auto slices = [&](V q, V slope, V ww, V x1, V x2) -> Slices {
+        const V x = T(0.5) * (x1 + x2), width = x2 - x1, r = T(0.5) * width;
+        const V o0 = overlap_at(q, slope, ww, x), o1 = -width * (slope + ww * x), o2 = ww * r * r;
+        const V o = o0 - T(1.0 / 3.0) * o2, first = r * T(1.0 / 3.0) * o1;
+        const V square = o0 * (o0 - T(2.0 / 3.0) * o2) + T(1.0 / 3.0) * o1 * o1 + T(0.2) * o2 * o2;
+        const V second = r * r * (T(1.0 / 3.0) * o0 - T(0.2) * o2);
+        return {width * square, width * o, width * (x * o + first),
+                width * (x * (x * o + T(2) * first) + second)};
+    };
+    // rigidity = E* f; turning: d ln rigidity / d cosine
     struct Edges {
-        V3 delta, a, b, along_a, along_b;
-        V la, lb, in_la, in_lb, cosine, cross, sine, in_sine2, reach, rigidity, steepness;
+        V3 delta, along_a, along_b;
+        V la, lb, in_la, in_lb, cosine, cross, sine, reach, rigidity, steepness, turning;
     };
-    // weight_rate: d ln weight / d cosine
-    auto side_share = [&](const Edges& e, V sigma, V weight, V weight_rate) -> Share {
-        const V3 along_b = e.along_b * sigma;
-        const V cosine = smaller(e.cosine * sigma, V(T(1)));
-        const V twice = root(T(2) * (T(1) + cosine)), in_twice = T(1) / twice;
-        const V3 middle = (e.along_a + along_b) * in_twice;
-        // b.middle = sigma l_b twice / 2
-        const V in_bm = T(2) * sigma * e.in_lb * in_twice, t0 = e.delta.dot(middle) * -in_bm;
-        const V ratio = sigma * e.la * e.in_lb, in_ratio = sigma * e.lb * e.in_la;
-        const V3 d0 = e.delta + e.b * t0, dv = e.b * ratio - e.a;
-        const V begin = -t0 * in_ratio, end = (T(1) - t0) * in_ratio;
-        const V first = smaller(begin, end), last = larger(begin, end);
-        const V low = larger(V(T(0)), first), high = smaller(V(T(1)), last);
-        const V vv = dv.dot(dv), flat = PARALLEL2 * e.la * e.la;
-        const V deepest = vv > flat ? -d0.dot(dv) / larger(vv, flat) : T(0.5) * (low + high);
-        const V mean = T(0.5) * (T(1) + e.lb * e.in_la), beyond = (T(2) * FURTHER) * mean;
-        const V ahead = smaller(V(T(0)), first) - beyond, behind = larger(V(T(1)), last) + beyond;
+    // slices across the mean direction of a and sigma b; wider = 1 / (1 + cosine), in_ww = 1 / w^2
+    struct Way { V sigma, weight, wider, in_ww, leading; };
+    auto side_share = [&](const Edges& e, const Way& way) -> Share {
+        const V sigma = way.sigma, wider = way.wider, none = V(T(0));
+        const V3 along_b = e.along_b * sigma, mean = e.along_a + along_b, w = along_b - e.along_a;
+        const V offset = e.delta.dot(mean) * -wider;
+        const V3 d0 = e.delta + along_b * offset;
+        const V first = (sigma > T(0) ? none : -e.lb) - offset, last = first + e.lb;
+        const V low = larger(none, first), high = smaller(e.la, last);
+        const V w2 = w.dot(w), ww = larger(w2, V(PARALLEL2));
+        const V deepest = w2 > PARALLEL2 ? d0.dot(w) * -way.in_ww : T(0.5) * (low + high);
+        const V both = e.la + e.lb, beyond = FURTHER * both;
+        const V ahead = smaller(none, first) - beyond, behind = larger(e.la, last) + beyond;
         const V u_h = smaller(larger(deepest, ahead), behind);
-        const V3 nearest = d0 + dv * u_h;
-        const V h = root(nearest.dot(nearest)), sum = e.reach + h, in_both = T(1) / (h * sum);
-        const V in_h = sum * in_both, in_wide = h * in_both, in_root = root(in_wide);
-        const V q = (e.reach - h) * sum, slope = nearest.dot(dv);
-        const Slices sums = slices(q, slope, vv, u_h, low, high, mean);
-        const M touches = (sums.width > NEAR) & (h < e.reach) & (weight > T(0));
-        const V rigid = weight * e.rigidity * (T(2) * e.sine * in_twice) * e.la;
+        const V3 nearest = d0 + w * u_h;
+        const V h = root(nearest.dot(nearest)), sum = e.reach + h, in_h = T(1) / (h * sum);
+        const V q = (e.reach - h) * sum, slope = nearest.dot(w);
+        const V wide = root(larger(slope * slope + ww * q, none));
+        const V begin = low - u_h, end = high - u_h;
+        const V x1 = larger(begin, (wide + slope) * -way.in_ww);
+        const V x2 = smaller(end, (wide - slope) * way.in_ww);
+        const V width = x2 - x1, rounding = NEAR * e.la;
+        const M touches =
+            (high > low) & (h < e.reach) & (width > rounding) & (way.weight > T(0));
+        const Slices sums = slices(q, slope, ww, x1, x2);
+        const V in_wide = in_h * h, in_root = root(in_wide);
+        const V rigid = way.weight * e.rigidity * e.sine * root(T(2) * wider);
         const V scale = T(0.5) * rigid * in_wide * in_wide * in_root;
+        const V most = smaller(T(2) * wide * way.in_ww, T(0.5) * both);
+        const V parts = T(1) / larger(most * sums.o, V(TINY));
+        const V place = u_h + sums.ox * (parts * most);
         Share share;
         share.energy = scale * sums.o2;
-        share.stiffness = rigid * sums.width * in_root;
-        share.damped = share.stiffness * sums.part;
-        share.s = sums.at;
-        share.t = t0 + share.s * ratio;
+        share.stiffness = rigid * width * in_root;
+        share.damped = share.stiffness * width * (parts * sums.o);
+        share.s = place * e.in_la;
+        share.t = (offset + place) * (sigma * e.in_lb);
         share.depth = e.reach - h;
         const V pull = T(-4) * scale;
-        const V3 whole = (d0 * sums.o + dv * sums.ou) * pull;
-        const V3 moment = (d0 * sums.ou + dv * sums.ouu) * pull;
-        const V3 by_h = nearest * (T(-2.5) * share.energy * in_wide * in_h);
-        share.by_delta = whole + by_h;
-        share.by_a = (moment + by_h * u_h) * V(T(-1));
-        share.by_b = whole * t0 + moment * ratio + by_h * (t0 + u_h * ratio);
-        V by_t0 = share.by_delta.dot(e.b), by_ratio = -share.by_a.dot(e.b);
-        auto squared = [&](V u) -> V {
-            const V x = u - u_h, o = q - (T(2) * slope + vv * x) * x;
-            return scale * o * o;
-        };
-        const V none = V(T(0)), held = by_h.dot(dv);
+        const V3 deeper = nearest * (T(-2.5) * share.energy * in_h);
+        const V by_o = pull * sums.o, by_ox = pull * sums.ox, by_oxx = pull * sums.oxx;
+        const V3 whole = nearest * by_o + w * by_ox + deeper;
+        const V3 moment = nearest * by_ox + w * by_oxx + whole * u_h;
         // half where ends face each other and rounding would decide
         auto beyond_zero = [&](V x) -> V {
-            return x > NEAR ? V(T(1)) : (x < -NEAR ? none : V(T(0.5)));
+            return x > rounding ? V(T(1)) : (x < -rounding ? none : V(T(0.5)));
         };
-        const V at_high = sums.u2 >= high ? beyond_zero(T(1) - last) * squared(sums.u2) : none;
-        const V at_low = sums.u1 <= low ? beyond_zero(first) * squared(sums.u1) : none;
+        auto squared = [&](V x) -> V {
+            const V o = overlap_at(q, slope, ww, x);
+            return scale * o * o;
+        };
+        const V at_high = x2 >= end ? squared(x2) : none, held = deeper.dot(w);
         // slices may be deepest far beyond both, where the mean length beyond them ends
         const M is_ahead = deepest < ahead, is_behind = deepest > behind;
-        const V at_first = is_ahead ? beyond_zero(-first) * held : none;
-        const V at_last = is_behind ? beyond_zero(last - T(1)) * held : none;
-        const V stretched = is_ahead ? held : (is_behind ? -held : none);
-        by_t0 = by_t0 - (at_high - at_low + at_first + at_last) * in_ratio;
-        by_ratio = by_ratio + (FURTHER * sigma * in_ratio * stretched - at_high * sums.u2
-            + at_low * sums.u1 - at_first * first - at_last * last) * in_ratio;
-        // twice^2 = 2 (1 + cosine)
-        V by_cosine = weight_rate - in_twice * in_twice;
-        const V steep = (T(2) * e.steepness + T(1)) * cosine * e.in_sine2;
-        by_cosine = share.energy * (e.cross > TURNING_SINE ? by_cosine - steep : by_cosine);
-        by_t0 = by_t0 * -in_bm;
-        share.by_delta = share.by_delta + middle * by_t0;
-        const V3 turned = d0 * (by_t0 * in_twice);
-        share.by_a = share.by_a + e.along_a * (share.energy * e.in_la + by_ratio * sigma * e.in_lb)
-            + ((along_b - e.along_a * cosine) * by_cosine + turned
-               - e.along_a * turned.dot(e.along_a)) * e.in_la;
-        share.by_b = share.by_b + middle * (by_t0 * t0)
-            - e.b * (by_ratio * ratio * e.in_lb * e.in_lb)
-            + ((e.along_a - along_b * cosine) * by_cosine + turned
-               - along_b * turned.dot(along_b)) * (sigma * e.in_lb);
+        const V ends = beyond_zero(last - e.la);
+        V at_last = beyond_zero(e.la - last) * at_high;
+        V at_first = x1 <= begin ? -beyond_zero(first) * squared(x1) : none;
+        V by_length_a = at_high - at_last;
+        at_first = at_first + (is_ahead ? beyond_zero(-first) * held : none);
+        at_last = at_last + (is_behind ? ends * held : none);
+        const V stretched = FURTHER * (is_behind ? held : (is_ahead ? -held : none));
+        by_length_a = by_length_a + (is_behind ? (T(1) - ends) * held : none) + stretched;
+        // along sigma b
+        const V by_length_b = sigma * stretched + (sigma > T(0) ? at_last : at_first);
+        const V by_cosine = share.energy * (way.leading - T(0.5) * wider + sigma * e.turning);
+        // slices turn with the mean direction: d0 stays across it
+        const V turn_by = (whole.dot(along_b) - at_first - at_last) * -wider;
+        share.by_delta = whole + mean * turn_by;
+        const V3 turned = d0 * turn_by;
+        const V3 g_a = turned - moment + along_b * by_cosine;
+        const V3 g_b = turned + moment + e.along_a * by_cosine + share.by_delta * offset;
+        const V in_lb = sigma * e.in_lb;
+        share.by_a = g_a * e.in_la + e.along_a * (by_length_a - e.in_la * g_a.dot(e.along_a));
+        share.by_b = g_b * in_lb
+            + along_b * (by_length_b - in_lb * g_b.dot(along_b));
         kept_where(touches, share);
         return share;
     };
     // of a tip; the segment begins at delta from it
-    auto tip_share = [&](const V3& delta, const V3& b, V lb, V in_lb, V reach, V rigidity, M is_tip)
-        -> Share {
-        const V bb = lb * lb, in_bb = in_lb * in_lb;
-        const V t_h = clamp01(-delta.dot(b) * in_bb);
-        const V3 nearest = delta + b * t_h;
-        const V h = root(nearest.dot(nearest)), sum = reach + h, in_both = T(1) / (h * sum);
-        const V q = (reach - h) * sum;
-        const Slices sums = slices(q, nearest.dot(b), bb, t_h, V(T(0)), V(T(1)), V(T(1)));
-        const V in_wide = h * in_both, in_root = root(in_wide);
-        const V rigid = rigidity * lb, scale = T(0.5) * rigid * in_wide * in_wide * in_root;
+    auto tip_share = [&](const V3& delta, const V3& along, V length, V in_length, V reach,
+                         V rigidity, M is_tip) -> Share {
+        const V none = V(T(0)), one = V(T(1));
+        const V t_h = smaller(larger(-delta.dot(along), none), length);
+        const V3 nearest = delta + along * t_h;
+        const V h = root(nearest.dot(nearest)), sum = reach + h, in_h = T(1) / (h * sum);
+        const V q = (reach - h) * sum, slope = nearest.dot(along);
+        const V wide = root(larger(slope * slope + q, none));
+        const V x1 = larger(-t_h, -wide - slope), x2 = smaller(length - t_h, wide - slope);
+        const Slices sums = slices(q, slope, one, x1, x2);
+        const V in_wide = in_h * h, in_root = root(in_wide), width = x2 - x1;
+        const V scale = T(0.5) * rigidity * in_wide * in_wide * in_root;
+        const V most = smaller(T(2) * wide, length), held = larger(sums.o, V(TINY));
+        const V parts = T(1) / (most * held);
         Share share;
         share.energy = scale * sums.o2;
-        share.stiffness = rigid * sums.width * in_root;
-        share.damped = share.stiffness * sums.part;
-        share.s = V(T(0));
-        share.t = sums.at;
+        share.stiffness = rigidity * width * in_root;
+        share.damped = share.stiffness * width * (held * parts);
+        share.s = none;
+        share.t = (t_h + sums.ox * (most * parts)) * in_length;
         share.depth = reach - h;
-        const V3 by_h = nearest * (T(-2.5) * share.energy * in_both);
-        const V pull = T(-4) * scale;
-        share.by_delta = (delta * sums.o + b * sums.ou) * pull + by_h;
+        const V pull = T(-4) * scale, by_ox = pull * sums.ox;
+        share.by_delta = nearest * (pull * sums.o - T(2.5) * share.energy * in_h) + along * by_ox;
+        const V3 moment = nearest * by_ox + along * (pull * sums.oxx) + share.by_delta * t_h;
         share.by_a = nothing3;
-        share.by_b = (delta * sums.ou + b * sums.ouu) * pull + by_h * t_h
-            + b * (share.energy * in_bb);
+        share.by_b = (moment + along * share.energy) * in_length;
         kept_where(is_tip & (h < reach), share);
         return share;
     };
@@ -249,12 +243,13 @@ SPRINGS = """
 # 0 for lanes of either kind; HAS_TIPS where a patch may be at the end of a fiber.
 NORMAL = """
     const V reach = g.reach;
-    Edges e = {delta, a, b};
+    Edges e = {delta};
     e.la = root(a.dot(a));
     e.lb = root(b.dot(b));
-    const V in_both = T(1) / (e.la * e.lb);
-    e.in_la = e.lb * in_both;
-    e.in_lb = e.la * in_both;
+    // two divisions: of nearly parallel segments only the difference counts
+    e.in_la = T(1) / e.la;
+    e.in_lb = T(1) / e.lb;
+    const V in_both = e.in_la * e.in_lb;
     e.along_a = a * e.in_la;
     e.along_b = b * e.in_lb;
     e.cosine = a.dot(b) * in_both;
@@ -275,29 +270,47 @@ NORMAL = """
         return at;
     };
     Share share;
+    const V sine2 = e.sine * e.sine;
     if constexpr (!KIND::IS_SHARED) {
-        e.in_sine2 = T(1) / (e.sine * e.sine);
         share = point_share(e.rigidity);
         // a wider angle stores less: d ln P = -2 cos d cos / sin^2
-        V twist = T(-2) * e.steepness * share.energy * e.cosine * e.in_sine2;
+        V twist = T(-2) * e.steepness * share.energy * e.cosine / sine2;
         twist = e.cross > TURNING_SINE ? twist : V(T(0));
         share.by_a = share.by_a + (e.along_b - e.along_a * e.cosine) * (twist * e.in_la);
         share.by_b = share.by_b + (e.along_a - e.along_b * e.cosine) * (twist * e.in_lb);
     } else {
-        const V sigma = e.cosine < T(0) ? V(T(-1)) : V(T(1));
+        Way way = {e.cosine < T(0) ? V(T(-1)) : V(T(1))};
+        const V3 apart = e.along_b * way.sigma - e.along_a;
+        const V ww = larger(apart.dot(apart), V(PARALLEL2)), side = T(1) + smaller(cosine, V(T(1)));
+        const V ends = side * ww;
+        const M two_ways = (KIND::WAYS == 2) | (cosine < BOTH_WAYS);
+        V in_sine2, in_ends, rest, other;
         if constexpr (KIND::WAYS == 1) {
-            e.in_sine2 = T(1) / (e.sine * e.sine);
-            share = side_share(e, sigma, V(T(1)), V(T(0)));
+            const V in_all = T(1) / (sine2 * ends);
+            in_sine2 = ends * in_all;
+            in_ends = sine2 * in_all;
+            way.weight = V(T(1));
+            way.leading = V(T(0));
         } else {
-            const M two_ways = (KIND::WAYS == 2) | (cosine < BOTH_WAYS);
-            const V weight = two_ways ? smaller(T(0.5) + cosine, V(T(1))) : V(T(1));
-            const V rest = T(1) - weight, other = larger(rest, V(SMALL));
-            const V in_all = T(1) / (e.sine * e.sine * weight * other);
-            const V rate = e.sine * e.sine * in_all;
-            e.in_sine2 = weight * other * in_all;
-            share = side_share(e, sigma, weight, two_ways ? other * rate : V(T(0)));
+            way.weight = two_ways ? smaller(T(0.5) + cosine, V(T(1))) : V(T(1));
+            rest = T(1) - way.weight;
+            other = larger(rest, V(SMALL));
+            const V in_all = T(1) / (sine2 * ends * way.weight * other);
+            const V in_weights = sine2 * ends * in_all, in_sides = way.weight * other * in_all;
+            in_sine2 = ends * in_sides;
+            in_ends = sine2 * in_sides;
+            way.leading = two_ways ? other * in_weights : V(T(0));
+            other = way.weight * in_weights;
+        }
+        way.wider = in_ends * ww;
+        way.in_ww = in_ends * side;
+        const V turning = (T(-2) * e.steepness - T(1)) * e.cosine * in_sine2;
+        e.turning = e.cross > TURNING_SINE ? turning : V(T(0));
+        share = side_share(e, way);
+        if constexpr (KIND::WAYS != 1) {
             if (KIND::WAYS == 2 || any(two_ways)) {
-                const Share more = side_share(e, -sigma, rest, weight * rate);
+                const Share more = side_share(
+                    e, Way{-way.sigma, rest, T(2) * way.in_ww, T(0.5) * way.wider, other});
                 const V energy = share.energy + more.energy;
                 const V part = more.energy / larger(energy, V(TINY));
                 share.s = share.s + (more.s - share.s) * part;
@@ -316,20 +329,23 @@ NORMAL = """
             const M is_tip_j = t < T(0.5) ? tip0_j : tip1_j;
             s = s < T(0.5) ? V(T(0)) : V(T(1));
             t = t < T(0.5) ? V(T(0)) : V(T(1));
-            Share tip = tip_share(delta - a * s, b, e.lb, e.in_lb, reach, g.round_i, is_tip_i);
+            Share tip = tip_share(
+                delta - a * s, e.along_b, e.lb, e.in_lb, reach, g.round_i, is_tip_i);
             tip.s = s;
             tip.by_a = tip.by_delta * -s;
             replace(tip.energy > share.energy, share, tip);
             tip = tip_share(
-                nothing3 - delta - b * t, a, e.la, e.in_la, reach, g.round_j, is_tip_j);
+                nothing3 - delta - b * t, e.along_a, e.la, e.in_la, reach, g.round_j, is_tip_j);
             tip.s = tip.t;
             tip.t = t;
             tip.by_a = tip.by_b;
             tip.by_b = tip.by_delta * -t;
             tip.by_delta = tip.by_delta * V(T(-1));
             replace(tip.energy > share.energy, share, tip);
-            tip = point_share(g.round_both);
-            replace(is_tip_i & is_tip_j & (tip.energy > share.energy), share, tip);
+            if (any(is_tip_i & is_tip_j)) {
+                tip = point_share(g.round_both);
+                replace(is_tip_i & is_tip_j & (tip.energy > share.energy), share, tip);
+            }
         }
     }
     s = share.s;

@@ -42,12 +42,18 @@ _ROWS = """
         y = __builtin_shufflevector(lo, up, 4, 5, 6, 7, 12, 13, 14, 15);
         z = __builtin_shufflevector(z0, z1, 0, 1, 2, 3, 4, 5, 6, 7);
     };
-    auto turn = [&](const auto* rows) -> V3 {
+    // of the rows of all lanes, straight from registers: what was stored in halves of a register
+    // cannot be loaded as a whole one before it is in the cache
+    auto turn = [&](auto row) -> V3 {
         V3 out;
+        #pragma unroll
         for (int h = 0; h < W / 8; ++h) {
-            auto x = __builtin_shufflevector(rows[0], rows[0], 0, 0, 0, 0, 0, 0, 0, 0);
+            decltype(row(0)) r[8];
+            #pragma unroll
+            for (int l = 0; l < 8; ++l) r[l] = row(8 * h + l);
+            auto x = __builtin_shufflevector(r[0], r[0], 0, 0, 0, 0, 0, 0, 0, 0);
             auto y = x, z = x;
-            eight(rows + 8 * h, x, y, z);
+            eight(r, x, y, z);
             ((T8*)&out.x)[h] = __builtin_convertvector(x, T8);
             ((T8*)&out.y)[h] = __builtin_convertvector(y, T8);
             ((T8*)&out.z)[h] = __builtin_convertvector(z, T8);
@@ -82,19 +88,26 @@ _ROWS = """
 # Distance vector and closest points of pairs of segments that begin at nodes, products of their
 # edges.
 DISTANCE = """
+    auto edges = [&](const int* node_i, const int* node_j, V3& a, V3& b, V3& delta) {
+        const double* const x = (const double*)place;
+        auto edge = [&](int node) -> P4 {
+            P4 start, end;
+            two_rows(x, node, start, end);
+            return end - start;
+        };
+        auto start = [&](int node) -> P4 {
+            P4 row;
+            __builtin_memcpy(&row, x + 3L * node, sizeof(P4));
+            return row;
+        };
+        a = turn([&](int l) -> P4 { return edge(node_i[l]); });
+        b = turn([&](int l) -> P4 { return edge(node_j[l]); });
+        delta = turn([&](int l) -> P4 { return start(node_j[l]) - start(node_i[l]); });
+    };
     auto closest = [&](I images, const int* node_i, const int* node_j, V& s, V& t,
                        V& aa, V& bb, V& ab) -> V3 {
-        P4 rows_a[W], rows_b[W], rows_d[W];
-        for (int l = 0; l < W; ++l) {
-            P4 xi, xi1, xj, xj1;
-            two_rows((const double*)place, node_i[l], xi, xi1);
-            two_rows((const double*)place, node_j[l], xj, xj1);
-            rows_a[l] = xi1 - xi;
-            rows_b[l] = xj1 - xj;
-            rows_d[l] = xj - xi;
-        }
-        const V3 a = turn(rows_a), b = turn(rows_b);
-        V3 delta = turn(rows_d);
+        V3 a, b, delta;
+        edges(node_i, node_j, a, b, delta);
         add_images(images, delta);
         aa = larger(a.dot(a), V(TINY));
         bb = larger(b.dot(b), V(TINY));

@@ -22,10 +22,11 @@ LANES = 16
 PARTS = 2  # of the list; as many workers share a sweep
 TIP_BITS = 2  # of a segment in `near_i`, below its first node: first, last one of its fiber
 AHEAD = 4  # blocks of pairs whose nodes are fetched
+RUNS = 6  # laws of one kind in a row: they stay in the cache of instructions
 FAR = 16  # the same of the list itself
 READ_AHEAD = (1 + AHEAD) * LANES  # what the lists of pairs have room for behind their end
 KEEPS_LOADS, KEEPS_RECORD = 1, 2  # what is stored by pair; see `contact_losses`
-LINE = 8  # numbers per node and part: force, moment, two unused; the first line is of zeros
+LINE = 8  # numbers per node and part: force, moment, two of no use; the first line is of zeros
 
 
 def capsule_constants(name: str, features: CapsuleFeatures) -> str:
@@ -42,6 +43,7 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
         "TIP_BITS": TIP_BITS,
         "AHEAD": AHEAD,
         "FAR": FAR,
+        "RUN": RUNS * LANES,
         "SLOT_HALT": HALT,
         "KEEPS_LOADS": KEEPS_LOADS,
         "KEEPS_RECORD": KEEPS_RECORD,
@@ -55,13 +57,14 @@ def capsule_constants(name: str, features: CapsuleFeatures) -> str:
 # What a pair that begins to act takes over (`contact_memory.neighbors_memory`).
 _HAND_OVER = """
     const int now = (int)step[0], last = now - 1;
-    T* const kept_now = (T*)pair_memory + 4L * kept_size * (now & 1);
-    const T* const kept_last = (const T*)pair_memory + 4L * kept_size * (last & 1);
-    int* const written_now = pair_step + (long)kept_size * (now & 1);
-    const int* const written_last = pair_step + (long)kept_size * (last & 1);
+    // a pair has both steps beside each other, in one cache line
+    T* const kept_now = (T*)pair_memory + 4 * (now & 1);
+    const T* const kept_last = (const T*)pair_memory + 4 * (last & 1);
+    int* const written_now = pair_step + (now & 1);
+    const int* const written_last = pair_step + (last & 1);
     auto memory_of = [&](int i, int j, int image) -> int {
         for (int k = out_start[i]; k < out_start[i + 1]; ++k)
-            if (pair_j[k] == j && pair_image[k] == image && written_last[k] == last) return k;
+            if (pair_j[k] == j && pair_image[k] == image && written_last[2L * k] == last) return k;
         return -1;
     };
     auto neighbors_memory = [&](int k, int on_i, int on_j, T far_i, T far_j) -> int {
@@ -74,7 +77,7 @@ _HAND_OVER = """
             }
             if (p == i && q == j) continue;
             const int found = memory_of(p, q, image);
-            if (found >= 0 && kept_last[4L * found + 3] != T(0)) return found;
+            if (found >= 0 && kept_last[8L * found + 3] != T(0)) return found;
         }
         return -1;
     };
@@ -85,7 +88,6 @@ _LAW = """
     auto law = [&](auto kind, const int* ats, const T* ss, const T* ts, int count)
         __attribute__((noinline)) {
         typedef decltype(kind) KIND;
-        P4 rows_a[W], rows_b[W], rows_d[W];
         int ks[W], node_i[W], node_j[W];
         I code_i, code_j, images;
         for (int l = 0; l < W; ++l) {
@@ -94,13 +96,8 @@ _LAW = """
             ((int*)&code_i)[l] = of_i;
             ((int*)&code_j)[l] = of_j;
             ((int*)&images)[l] = near_image[at];
-            const long at_i = node_i[l] = of_i >> TIP_BITS, at_j = node_j[l] = of_j >> TIP_BITS;
-            P4 xi, xi1, xj, xj1;
-            two_rows((const double*)place, at_i, xi, xi1);
-            two_rows((const double*)place, at_j, xj, xj1);
-            rows_a[l] = xi1 - xi;
-            rows_b[l] = xj1 - xj;
-            rows_d[l] = xj - xi;
+            node_i[l] = of_i >> TIP_BITS;
+            node_j[l] = of_j >> TIP_BITS;
         }
         auto of = [](const T* from) -> V {
             V v;
@@ -118,8 +115,8 @@ _LAW = """
                     return v;
                 });
         const Springs& g = one_group ? alike : mixed;
-        const V3 a = turn(rows_a), b = turn(rows_b);
-        V3 delta = turn(rows_d);
+        V3 a, b, delta;
+        edges(node_i, node_j, a, b, delta);
         add_images(images, delta);
         const M tip0_i = tipped(code_i, 1), tip1_i = tipped(code_i, 2);
         const M tip0_j = tipped(code_j, 1), tip1_j = tipped(code_j, 2);
@@ -130,25 +127,27 @@ _LAW = """
 
         const V arm_i = T(0.5) * (distance + g.lever), arm_j = distance - arm_i;
         V size = force;
-        V3 drag = same3(0, 0, 0);
-        T8 memories[W];
+        V3 drag = nothing3, path = nothing3;
         if constexpr (HAS_DASHPOT || HAS_FRICTION) {
-            // differences and sums before rows are turned: three of them instead of eight
-            T4 apart[W], rolled[W], spun[W];
-            for (int l = 0; l < W; ++l) {
-                const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
-                auto between = [&](const T* of, int node, T part) -> T4 {
-                    T4 start, end;
-                    two_rows(of, node, start, end);
-                    return start + (end - start) * part;
-                };
-                const T* const v = (const T*)node_velocity, * const w = (const T*)node_spin;
-                apart[l] = between(v, node_i[l], s_l) - between(v, node_j[l], t_l);
-                const T4 wi = between(w, node_i[l], s_l), wj = between(w, node_j[l], t_l);
-                rolled[l] = wi * ((const T*)&arm_i)[l] + wj * ((const T*)&arm_j)[l];
-                spun[l] = wi + wj;
-            }
-            const V3 slip = turn(apart) + turn(rolled).cross(n);
+            // differences and sums before rows are turned: two of them instead of eight
+            auto between = [&](const auto& of, const int* nodes, const V& part, int l) -> T4 {
+                T4 start, end;
+                two_rows((const T*)of, nodes[l], start, end);
+                return start + (end - start) * ((const T*)&part)[l];
+            };
+            const V3 apart = turn([&](int l) -> T4 {
+                return between(node_velocity, node_i, s, l) - between(node_velocity, node_j, t, l);
+            });
+            const V3 spun = turn([&](int l) -> T4 {
+                return between(node_spin, node_i, s, l) + between(node_spin, node_j, t, l);
+            });
+            // spins of both times their arms, which differ where radii do
+            V3 rolled = spun * (T(0.5) * distance);
+            if (!one_group)
+                rolled = rolled + turn([&](int l) -> T4 {
+                    return between(node_spin, node_i, s, l) - between(node_spin, node_j, t, l);
+                }) * (T(0.5) * g.lever);
+            const V3 slip = apart + rolled.cross(n);
             const V approach = slip.dot(n);
             const V rest_s = T(1) - s, rest_t = T(1) - t;
             const V mass = T(1) / (rest_s * rest_s * (tip0_i ? g.tip_i : g.in_i)
@@ -162,7 +161,7 @@ _LAW = """
             if constexpr (HAS_FRICTION) {
                 const V k = g.shear_part * stiffness;
                 const V3 slide = slip - n * approach;
-                const V twist = T(0.5) * dt * turn(spun).dot(n);
+                const V twist = T(0.5) * dt * spun.dot(n);
                 const V far_i = e.la * smaller(s, rest_s), far_j = e.lb * smaller(t, rest_t);
                 T4 kept[W];
                 T before_of[W];
@@ -171,7 +170,7 @@ _LAW = """
                 for (unsigned left = mine; left != 0; left &= left - 1) {
                     const int l = __builtin_ctz(left);
                     int from = ks[l];
-                    if (__builtin_expect(written_last[from] != last, 0)) {
+                    if (__builtin_expect(written_last[2L * from] != last, 0)) {
                         const int i = pair_i[from], j = pair_j[from];
                         const T s_l = ((const T*)&s)[l], t_l = ((const T*)&t)[l];
                         const int tips_i = ~((const int*)&code_i)[l];
@@ -182,10 +181,10 @@ _LAW = """
                             from, i + to_i, j + to_j, ((const T*)&far_i)[l], ((const T*)&far_j)[l]);
                         if (from < 0) continue;
                     }
-                    __builtin_memcpy(&kept[l], kept_last + 4L * from, sizeof(T4));
-                    before_of[l] = kept_last[4L * from + 3];
+                    __builtin_memcpy(&kept[l], kept_last + 8L * from, sizeof(T4));
+                    before_of[l] = kept_last[8L * from + 3];
                 }
-                const V3 h = turn(kept);
+                const V3 h = turn([&](int l) -> T4 { return kept[l]; });
                 const V before = of(before_of);
                 V3 flat = h - n * h.dot(n);
                 flat = flat + n.cross(flat) * twist;
@@ -194,7 +193,7 @@ _LAW = """
                 const V scale2 = h.dot(h) * (deeper ? before : V(T(1)))
                     / (larger(flat.dot(flat), V(SMALL * SMALL)) * (deeper ? depth : V(T(1))));
                 const V scale = before > T(0) ? root(scale2) : V(T(0));
-                V3 path = flat * scale + slide * dt;
+                path = flat * scale + slide * dt;
                 drag = nothing3 - path * k - slide * (resistance * g.root_shear);
                 const V whole = root(drag.dot(drag)), limit = friction * size;
                 const M slides = whole > limit;
@@ -203,24 +202,23 @@ _LAW = """
                 const V back = -pulled * in_both;
                 path = V3{slides ? drag.x * back : path.x, slides ? drag.y * back : path.y,
                           slides ? drag.z * back : path.z};
-                const V numbers[8] = {path.x, path.y, path.z, depth, s, t, arm_i, arm_j};
-                turn_back(numbers, memories);
             }
         }
         const V3 whole = drag - n * (size - force) + share.by_delta;
         const V3 moment = n.cross(drag);
         T8 rows[4][W];
-        auto load_row = [&](int m, const V3& force_there, V part) {
+        // two numbers more: of the memory, which is turned with them
+        auto load_row = [&](int m, const V3& force_there, V part, V more, V last) {
             const V lever = part * (m < 2 ? arm_i : arm_j);
-            V numbers[8] = {force_there.x, force_there.y, force_there.z,
-                            moment.x * lever, moment.y * lever, moment.z * lever};
-            numbers[6] = numbers[7] = V(T(0));
+            const V numbers[8] = {
+                force_there.x, force_there.y, force_there.z,
+                moment.x * lever, moment.y * lever, moment.z * lever, more, last};
             turn_back(numbers, rows[m]);
         };
-        load_row(0, whole * (T(1) - s) + couple_i, T(1) - s);
-        load_row(1, whole * s - couple_i, s);
-        load_row(2, couple_j - whole * (T(1) - t), T(1) - t);
-        load_row(3, nothing3 - couple_j - whole * t, t);
+        load_row(0, whole * (T(1) - s) + couple_i, T(1) - s, path.x, path.y);
+        load_row(1, whole * s - couple_i, s, path.z, depth);
+        load_row(2, couple_j - whole * (T(1) - t), T(1) - t, V(T(0)), V(T(0)));
+        load_row(3, nothing3 - couple_j - whole * t, t, V(T(0)), V(T(0)));
         // not read again from memory behind every store
         T8* const lines = load_lines, * const own = load;
         wp::uint8* const touched = touch;
@@ -240,8 +238,9 @@ _LAW = """
             add(node_j[l] + 1, rows[3][l]);
             const long k = ks[l];
             if constexpr (HAS_FRICTION) {
-                __builtin_memcpy(memory_now + 4 * k, &memories[l], sizeof(T4));
-                step_now[k] = now;
+                __builtin_memcpy(memory_now + 8 * k, (const T*)&rows[0][l] + 6, 2 * sizeof(T));
+                __builtin_memcpy(memory_now + 8 * k + 2, (const T*)&rows[1][l] + 6, 2 * sizeof(T));
+                step_now[2 * k] = now;
             }
             if (keeps) {
                 auto lane = [&](const V& v) -> T { return ((const T*)&v)[l]; };
@@ -274,7 +273,7 @@ def capsule_sweep_source(name: str, features: CapsuleFeatures, arrays: list[str]
     law = _LAW.replace("NORMAL", NORMAL)
     addresses = ", ".join(f"{array} = {array}.data" for array in arrays)
     return f"""
-    const int kept_size = pair_step.shape[1], node_count = place.shape[0];
+    const int node_count = place.shape[0];
     const bool one_group = groups.shape[0] == 1;
     auto sweep = [=, {addresses}]() __attribute__((noinline)) {{
     #pragma clang fp contract(fast)
