@@ -17,7 +17,7 @@ from warpfiber.passes.chain_reply import make_reply_numbers
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.native import LANES, lane_types
 from warpfiber.passes.native_blocks import fill_text
-from warpfiber.passes.native_relaxation import BEGIN, relaxation_text
+from warpfiber.passes.native_relaxation import BEGIN, PARTS, relaxation_text
 from warpfiber.passes.relaxation_work import make_relaxation_begin, relaxation_struct
 
 REPLY_NUMBERS = 6  # of every group, see `chain_reply.make_reply_numbers`
@@ -34,35 +34,77 @@ RESET_FRICTION    };
     if (stage == ROWS_STAGE) part_used.data[part] = 0;
 """
 
+# `Ends`: of rows of fibers of one group, whose columns are found together.
 COLUMNS = """
     const long long room = columns.shape[0] / d.parts / W * W;
+    struct Ends { int held, fiber[W], row[W], side[W]; };
+    static_assert(sizeof(Ends) == WAITING * sizeof(int), "");
+    auto is_wanted = [&](int r, int side) -> bool {
+        const Row& row = rows[r];
+        return (row.force != T(0) || row.normal[3] < T(0)) && column_at.data[2 * r + side] < 0;
+    };
+    auto add_end = [](Ends& ends, int f, int r, int side) {
+        ends.fiber[ends.held] = f;
+        ends.row[ends.held] = r;
+        ends.side[ends.held++] = side;
+    };
+    // as many as there is room for
+    auto find_columns = [&](Ends& ends) {
+        if (ends.held == 0) return;
+        const int size = size_of(ends.fiber[0]);
+        T* column[W];
+        int lanes = 0;
+        for (; lanes < ends.held; ++lanes) {
+            const int of = d.fiber_part.data[ends.fiber[lanes]];
+            if (part_used.data[of] + size > room) break;
+            const long long at = of * room + part_used.data[of];
+            column[lanes] = columns.data + at;
+            column_at.data[2 * ends.row[lanes] + ends.side[lanes]] = (int)(at / W);
+            part_used.data[of] += size;
+        }
+        if (lanes > 0) fill(lanes, ends.fiber, ends.row, ends.side, columnAT_KIND);
+        ends.held = 0;
+    };
     auto column_of = [&](int f, int r, int side) -> const T* {
         int& at = column_at.data[2 * r + side];
         if (at >= 0) return columns.data + (long long)W * at;
-        const int size = size_of(f), of = d.fiber_part.data[f];
-        const long long used = part_used.data[of], left = (room - used) / size;
-        int lane_row[W] = {r}, lane_side[W] = {side}, lanes = 1;
-        if (left < 1) {
-            T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-            fill(f, 1, lane_row, lane_side, ownAT_KIND);
-            return own;
-        }
+        Ends ends;
+        ends.held = 0;
+        add_end(ends, f, r, side);
         each_end(f, [&](int other, int at_side) {
-            if (lanes == W || lanes == left || (other == r && at_side == side)) return;
-            const Row& row = rows[other];
-            if (row.force == T(0) && !(row.normal[3] < T(0))) return;
-            if (column_at.data[2 * other + at_side] >= 0) return;
-            lane_row[lanes] = other;
-            lane_side[lanes++] = at_side;
+            if (ends.held == W || (other == r && at_side == side)) return;
+            if (is_wanted(other, at_side)) add_end(ends, f, other, at_side);
         });
-        T* const own = columns.data + of * room + used;
-        fill(f, lanes, lane_row, lane_side, ownAT_KIND);
-        for (int l = 0; l < lanes; ++l)
-            column_at.data[2 * lane_row[l] + lane_side[l]] =
-                (int)((of * room + used + (long long)l * size) / W);
-        part_used.data[of] = used + (long long)lanes * size;
+        find_columns(ends);
+        if (at >= 0) return columns.data + (long long)W * at;
+        const int of = d.fiber_part.data[f];
+        T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
+        fill(1, &f, &r, &side, &ownAT_KIND);
         return own;
     };
+    auto fetch_factors = [&](int f) {
+        const auto* const from = factors.data + (long long)row_stride * f;
+        const int nodes = d.fiber_node_start.data[f + 1] - d.fiber_node_start.data[f];
+        for (const char* at = (const char*)from; at < (const char*)(from + nodes); at += 64)
+            __builtin_prefetch(at);
+    };
+    // those that are likely to have a force, of fibers all over a part
+    if (stage == PARTS_STAGE) {
+        Ends* const ends_of = (Ends*)waiting.data + part * d.groups.shape[0];
+        for (int of = 0; of < d.groups.shape[0]; ++of) ends_of[of].held = 0;
+        for (int q = d.part_start.data[part]; q < d.part_start.data[part + 1]; ++q) {
+            const int f = d.fiber_order.data[q];
+            if (is_fixed(f)) continue;
+            Ends& ends = ends_of[d.fiber_group.data[f]];
+            each_end(f, [&](int r, int side) {
+                if (!is_wanted(r, side)) return;
+                if (ends.held == 0 || ends.fiber[ends.held - 1] != f) fetch_factors(f);
+                add_end(ends, f, r, side);
+                if (ends.held == W) find_columns(ends);
+            });
+        }
+        for (int of = 0; of < d.groups.shape[0]; ++of) find_columns(ends_of[of]);
+    }
     auto push = [&](int f, int r, int side, T change) {
         const T* const column = column_of(f, r, side);
         T* const mine = motion + d.fiber_at.data[f];
@@ -120,9 +162,11 @@ FRICTION = """
         const int size = size_of(f), of = d.fiber_part.data[f];
         const long long used = part_used.data[of], left = (room - used) / size;
         int lane_row[W] = {r}, lane_side[W] = {side}, lane_kind[W] = {1 + c}, lanes = 1;
+        int lane_fiber[W];
+        for (int l = 0; l < W; ++l) lane_fiber[l] = f;
         if (left < 1) {
             T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-            fill(f, 1, lane_row, lane_side, own, lane_kind);
+            fill(1, lane_fiber, lane_row, lane_side, &own, lane_kind);
             return own;
         }
         each_end(f, [&](int other, int at_side) {
@@ -136,15 +180,21 @@ FRICTION = """
                 lane_kind[lanes++] = 1 + k;
             }
         });
-        T* const own = columns.data + of * room + used;
-        fill(f, lanes, lane_row, lane_side, own, lane_kind);
+        T* column[W];
+        for (int l = 0; l < lanes; ++l) column[l] = columns.data + of * room + used + l * size;
+        fill(lanes, lane_fiber, lane_row, lane_side, column, lane_kind);
         for (int l = 0; l < lanes; ++l)
             place(lane_row[l], lane_side[l], lane_kind[l] - 1) =
                 (int)((of * room + used + (long long)l * size) / W);
         part_used.data[of] = used + (long long)lanes * size;
-        return own;
+        return column[0];
     };
 """
+
+
+def ends_numbers(name: str) -> int:
+    """Of the ends of one group that wait for their columns."""
+    return 1 + 3 * LANES[name]
 
 
 @cache
@@ -158,6 +208,8 @@ def make_chain_relaxation(
     begin_solve = make_relaxation_begin(name)
     reply_numbers = make_reply_numbers(name)
     fibers = SIZES + fill_text(LANES[name], friction) + (NORMALS if friction else "") + COLUMNS
+    fibers = fibers.replace("WAITING", str(ends_numbers(name)))
+    fibers = fibers.replace("PARTS_STAGE", str(PARTS))
     fibers = fibers.replace("AT_KIND", ", along_normal" if friction else "")
     fibers = fibers.replace("RESET_FRICTION", RESET if friction else "")
     rubs = FRICTION if friction else None
@@ -175,6 +227,8 @@ def make_chain_relaxation(
         columns: wp.array(dtype=real),
         part_used: wp.array(dtype=wp.int64),
         spare: wp.array(dtype=real),
+        gathered: wp.array(dtype=real),
+        waiting: wp.array(dtype=wp.int32),
         segment_impulse: wp.array(dtype=real),
     ): ...
 
@@ -192,6 +246,8 @@ def make_chain_relaxation(
         columns: wp.array(dtype=real),
         part_used: wp.array(dtype=wp.int64),
         spare: wp.array(dtype=real),
+        gathered: wp.array(dtype=real),
+        waiting: wp.array(dtype=wp.int32),
         segment_impulse: wp.array(dtype=real),
     ):
         if stage == wp.static(BEGIN):
@@ -222,6 +278,8 @@ def make_chain_relaxation(
             columns,
             part_used,
             spare,
+            gathered,
+            waiting,
             segment_impulse,
         )
 

@@ -11,13 +11,17 @@ import warp as wp
 
 from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
-from warpfiber.passes.chain_relaxation import REPLY_NUMBERS, make_chain_relaxation
+from warpfiber.passes.chain_relaxation import (
+    REPLY_NUMBERS,
+    ends_numbers,
+    make_chain_relaxation,
+)
 from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.native import LANES
-from warpfiber.passes.native_blocks import MOST_NODES
+from warpfiber.passes.native_blocks import FACTORS, MOST_NODES
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
 from warpfiber.passes.rub_response import make_chain_rub, rub_clear, rub_rows
@@ -344,6 +348,8 @@ class ChainResponse:
             self.block,
             self._array(parts, wp.int64),
             self._array(most * parts, p.real),
+            self._array(parts * lanes * (FACTORS * int(nodes.max()) + 1), p.real),
+            self._array(parts * len(model.group_rows) * ends_numbers(p.name), wp.int32),
             self.segment_impulse,
         ]
         kernel = make_chain_relaxation(p.name, dual.law.kind, friction=dual.rubs)
