@@ -34,76 +34,99 @@ RESET_FRICTION    };
     if (stage == ROWS_STAGE) part_used.data[part] = 0;
 """
 
-# `Ends`: of rows of fibers of one group, whose columns are found together.
+# Fibers of one group with as many wanted ends wait for each other.
 COLUMNS = """
     const long long room = columns.shape[0] / d.parts / W * W;
-    struct Ends { int held, fiber[W], row[W], side[W]; };
-    static_assert(sizeof(Ends) == WAITING * sizeof(int), "");
     auto is_wanted = [&](int r, int side) -> bool {
         const Row& row = rows[r];
         return (row.force != T(0) || row.normal[3] < T(0)) && column_at.data[2 * r + side] < 0;
     };
-    auto add_end = [](Ends& ends, int f, int r, int side) {
-        ends.fiber[ends.held] = f;
-        ends.row[ends.held] = r;
-        ends.side[ends.held++] = side;
-    };
-    // as many as there is room for
-    auto find_columns = [&](Ends& ends) {
-        if (ends.held == 0) return;
-        const int size = size_of(ends.fiber[0]);
-        T* column[W];
-        int lanes = 0;
-        for (; lanes < ends.held; ++lanes) {
-            const int of = d.fiber_part.data[ends.fiber[lanes]];
-            if (part_used.data[of] + size > room) break;
-            const long long at = of * room + part_used.data[of];
-            column[lanes] = columns.data + at;
-            column_at.data[2 * ends.row[lanes] + ends.side[lanes]] = (int)(at / W);
-            part_used.data[of] += size;
-        }
-        if (lanes > 0) fill(lanes, ends.fiber, ends.row, ends.side, columnAT_KIND);
-        ends.held = 0;
+    // a place for a column, if there is room
+    auto place_of = [&](int f, int r, int side) -> T* {
+        const int of = d.fiber_part.data[f], size = size_of(f);
+        if (part_used.data[of] + size > room) return nullptr;
+        const long long at = of * room + part_used.data[of];
+        column_at.data[2 * r + side] = (int)(at / W);
+        part_used.data[of] += size;
+        return columns.data + at;
     };
     auto column_of = [&](int f, int r, int side) -> const T* {
         int& at = column_at.data[2 * r + side];
         if (at >= 0) return columns.data + (long long)W * at;
-        Ends ends;
-        ends.held = 0;
-        add_end(ends, f, r, side);
+        int lane_fiber[W] = {f}, lane_row[W] = {r}, lane_side[W] = {side}, lanes = 1;
+        T* column[W] = {place_of(f, r, side)};
+        const bool fits = column[0] != nullptr;
+        if (!fits) column[0] = spare.data + d.fiber_part.data[f] * (spare.shape[0] / d.parts);
         each_end(f, [&](int other, int at_side) {
-            if (ends.held == W || (other == r && at_side == side)) return;
-            if (is_wanted(other, at_side)) add_end(ends, f, other, at_side);
+            if (!fits || lanes == W || !is_wanted(other, at_side)) return;
+            column[lanes] = place_of(f, other, at_side);
+            if (column[lanes] == nullptr) return;
+            lane_fiber[lanes] = f;
+            lane_row[lanes] = other;
+            lane_side[lanes++] = at_side;
         });
-        find_columns(ends);
-        if (at >= 0) return columns.data + (long long)W * at;
-        const int of = d.fiber_part.data[f];
-        T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-        fill(1, &f, &r, &side, &ownAT_KIND);
-        return own;
+        ready_factors(lanes, lane_fiber);
+        fill(lanes, lane_fiber, lane_row, lane_side, columnAT_KIND);
+        return column[0];
     };
-    auto fetch_factors = [&](int f) {
-        const auto* const from = factors.data + (long long)row_stride * f;
-        const int nodes = d.fiber_node_start.data[f + 1] - d.fiber_node_start.data[f];
-        for (const char* at = (const char*)from; at < (const char*)(from + nodes); at += 64)
-            __builtin_prefetch(at);
+    // the first wanted ends of some fibers, one of each at a time
+    auto find_columns = [&](int lanes, const int* fiber) {
+        if (lanes == 0) return;
+        int held[W] = {0}, row[W][W], side[W][W], most = 0;
+        for (int l = 0; l < lanes; ++l) {
+            each_end(fiber[l], [&](int r, int at_side) {
+                if (held[l] == W || !is_wanted(r, at_side)) return;
+                row[held[l]][l] = r;
+                side[held[l]++][l] = at_side;
+            });
+            most = held[l] > most ? held[l] : most;
+        }
+        ready_factors(lanes, fiber);
+        for (int n = 0; n < most; ++n) {
+            T* column[W];
+            for (int l = 0; l < lanes; ++l) {
+                column[l] = n < held[l] ? place_of(fiber[l], row[n][l], side[n][l]) : nullptr;
+                if (n >= held[l]) {
+                    row[n][l] = row[0][l];
+                    side[n][l] = side[0][l];
+                }
+            }
+            fill(lanes, fiber, row[n], side[n], columnAT_KIND);
+        }
     };
-    // those that are likely to have a force, of fibers all over a part
+    // those that are likely to have a force
     if (stage == PARTS_STAGE) {
-        Ends* const ends_of = (Ends*)waiting.data + part * d.groups.shape[0];
-        for (int of = 0; of < d.groups.shape[0]; ++of) ends_of[of].held = 0;
+        struct Waiting { int held, fiber[W]; };
+        static_assert(sizeof(Waiting) == WAITING * sizeof(int), "");
+        const int groups = (int)d.groups.shape[0];
+        Waiting* const waiting_of = (Waiting*)waiting.data + (long long)part * groups * W;
+        for (int of = 0; of < groups * W; ++of) waiting_of[of].held = 0;
         for (int q = d.part_start.data[part]; q < d.part_start.data[part + 1]; ++q) {
             const int f = d.fiber_order.data[q];
             if (is_fixed(f)) continue;
-            Ends& ends = ends_of[d.fiber_group.data[f]];
-            each_end(f, [&](int r, int side) {
-                if (!is_wanted(r, side)) return;
-                if (ends.held == 0 || ends.fiber[ends.held - 1] != f) fetch_factors(f);
-                add_end(ends, f, r, side);
-                if (ends.held == W) find_columns(ends);
-            });
+            int ends = 0;
+            each_end(f, [&](int r, int side) { ends += is_wanted(r, side); });
+            if (ends == 0) continue;
+            const int most = ends < W ? ends : W;
+            Waiting& list = waiting_of[d.fiber_group.data[f] * W + most - 1];
+            list.fiber[list.held++] = f;
+            if (list.held < W) continue;
+            find_columns(W, list.fiber);
+            list.held = 0;
         }
-        for (int of = 0; of < d.groups.shape[0]; ++of) find_columns(ends_of[of]);
+        for (int of = 0; of < groups; ++of) {
+            int rest[W], lanes = 0;
+            for (int n = W - 1; n >= 0; --n) {
+                const Waiting& list = waiting_of[of * W + n];
+                for (int k = 0; k < list.held; ++k) {
+                    rest[lanes++] = list.fiber[k];
+                    if (lanes < W) continue;
+                    find_columns(W, rest);
+                    lanes = 0;
+                }
+            }
+            find_columns(lanes, rest);
+        }
     }
     auto push = [&](int f, int r, int side, T change) {
         const T* const column = column_of(f, r, side);
@@ -166,6 +189,7 @@ FRICTION = """
         for (int l = 0; l < W; ++l) lane_fiber[l] = f;
         if (left < 1) {
             T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
+            ready_factors(1, lane_fiber);
             fill(1, lane_fiber, lane_row, lane_side, &own, lane_kind);
             return own;
         }
@@ -182,6 +206,7 @@ FRICTION = """
         });
         T* column[W];
         for (int l = 0; l < lanes; ++l) column[l] = columns.data + of * room + used + l * size;
+        ready_factors(lanes, lane_fiber);
         fill(lanes, lane_fiber, lane_row, lane_side, column, lane_kind);
         for (int l = 0; l < lanes; ++l)
             place(lane_row[l], lane_side[l], lane_kind[l] - 1) =
@@ -192,23 +217,27 @@ FRICTION = """
 """
 
 
-def ends_numbers(name: str) -> int:
-    """Of the ends of one group that wait for their columns."""
-    return 1 + 3 * LANES[name]
+def waiting_numbers(name: str) -> int:
+    """Of a list of fibers that wait for each other."""
+    return 1 + LANES[name]
 
 
 @cache
 def make_chain_relaxation(
-    name: str, law: str, module: str = "unique", friction: bool = False
+    name: str, law: str, module: str = "unique", friction: bool = False, found: bool = False
 ) -> Any:
-    """Kernel `chain_relax` (see `native_relaxation` for its stages): forces, shifts, impulses."""
+    """Kernel `chain_relax` (see `native_relaxation` for its stages): forces, shifts, impulses.
+
+    `found`: there are no factors but `axes` (`native_factor`).
+    """
     real = precision(name).real
     Relaxation = relaxation_struct(name)
     Factor = elimination_row(name)
     begin_solve = make_relaxation_begin(name)
     reply_numbers = make_reply_numbers(name)
-    fibers = SIZES + fill_text(LANES[name], friction) + (NORMALS if friction else "") + COLUMNS
-    fibers = fibers.replace("WAITING", str(ends_numbers(name)))
+    filled = fill_text(LANES[name], friction, found)
+    fibers = SIZES + filled + (NORMALS if friction else "") + COLUMNS
+    fibers = fibers.replace("WAITING", str(waiting_numbers(name)))
     fibers = fibers.replace("PARTS_STAGE", str(PARTS))
     fibers = fibers.replace("AT_KIND", ", along_normal" if friction else "")
     fibers = fibers.replace("RESET_FRICTION", RESET if friction else "")
@@ -222,6 +251,7 @@ def make_chain_relaxation(
         row_stride: wp.int32,
         fiber_pace: wp.array(dtype=real),
         factors: wp.array(dtype=Factor),
+        axes: wp.array(dtype=real),
         numbers: wp.array(dtype=real),
         column_at: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=real),
@@ -241,6 +271,7 @@ def make_chain_relaxation(
         step_size: wp.array(dtype=wp.float64),
         fiber_pace: wp.array(dtype=real),
         factors: wp.array(dtype=Factor),
+        axes: wp.array(dtype=real),
         numbers: wp.array(dtype=real),
         column_at: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=real),
@@ -273,6 +304,7 @@ def make_chain_relaxation(
             row_stride,
             fiber_pace,
             factors,
+            axes,
             numbers,
             column_at,
             columns,

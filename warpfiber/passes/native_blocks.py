@@ -11,26 +11,31 @@ Limits: CPU only; fibers of up to MOST_NODES nodes (stack); sums are in another 
 
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.native import transpose
+from warpfiber.passes.native_factor import FACTOR_TEXTS
 
 MOST_NODES = 512
 FACTORS = 29  # numbers of a node
 
 
-# `fill(lanes, fiber, row, side, column)`: columns of the ends `side` of `row` on fibers of one
-# group. With friction `kind` behind: 0 along the normal, 1 and 2 along the directions of the plane.
+# `ready_factors(lanes, fiber)`: of fibers of one group, then
+# `fill(lanes, fiber, row, side, column)`: columns of the ends `side` of `row` on these fibers, of
+# lanes whose `column` is somewhere.
+# With friction `kind` behind: 0 along the normal, 1 and 2 along the directions of the plane.
 # `turn(v)` transposes W vectors.
-def fill_text(lanes: int, friction: bool = False) -> str:
-    """C++ text of `fill`."""
+def fill_text(lanes: int, friction: bool = False, found: bool = False) -> str:
+    """C++ text; `found`: factors are found again by axes (`native_factor`), not read."""
     parts = {
         "KINDS": ", const int* kind" if friction else "",
         "LANE_PUSH": PULLS if friction else PUSHES,
         "NODE_PUSH": PULLED if friction else PUSHED,
         "LANE_SPIN": SPUN if friction else "",
         "CHI": repr(CHI),
+        "FACTORS_OF": FOUND if found else GATHERED,
+        **FACTOR_TEXTS,
         "TURN": transpose(lanes),
         "MOST_NODES": str(MOST_NODES),
     }
-    text = FILL
+    text = FACTORS_TEXT + FILL
     for key, value in parts.items():
         text = text.replace(key, value)
     return text
@@ -85,23 +90,8 @@ SPUN = """
         b[0] = torque * (h / (T(CHI) * group.torque * carried));"""
 
 
-# Factors of the fibers of all lanes are turned into vectors first, W numbers of a node at a time.
-FILL = """
-    auto fill = [&](int lanes, const int* fiber, const int* row, const int* side,
-            T* const* columnKINDS) __attribute__((noinline)) {
-        struct Factor { V3 d, o, q; V s; V3 l0, l1, l2, lt, move; V impulse; V3 axis; };
-        constexpr int numbers_of = sizeof(Factor) / sizeof(V);
-        static_assert(sizeof(factors.data[0]) == numbers_of * sizeof(T), "");
-        const int of = d.fiber_group.data[fiber[0]];
-        const auto& group = d.groups.data[of];
-        const int segments = group.segments;
-        const T* const number = numbers.data + 6 * of;
-        const long long whole = gathered.shape[0] / d.parts;
-        T* const unaligned = gathered.data + d.fiber_part.data[fiber[0]] * whole;
-        const auto over = (unsigned long long)unaligned % sizeof(V);
-        Factor* const factor = (Factor*)((char*)unaligned + (over ? sizeof(V) - over : 0));
-        V pace;
-        for (int l = 0; l < W; ++l) pace[l] = fiber_pace.data[fiber[l < lanes ? l : 0]];
+# Of every node in turn, from the rows of `chain_solve`, W numbers of all lanes at a time.
+GATHERED = """
         for (int k = 0; k <= segments; ++k) {
             const T* from[W];
             for (int l = 0; l < W; ++l)
@@ -115,6 +105,63 @@ FILL = """
                 for (int n = 0; n < W; ++n) ((V*)(factor + k))[first + n] = r[n];
             }
         }
+"""
+FOUND = """
+        const long long stride = (4 * row_stride + W - 1) / W * W;
+        for (int k = 0; k <= segments; k += W / 4) {
+            V r[W];
+            for (int l = 0; l < W; ++l)
+                r[l] = *(const U*)(axes.data + stride * fiber[l < lanes ? l : 0] + 4 * k);
+            TURN
+            for (int n = 0; n < W / 4 && k + n <= segments; ++n) {
+                factor[k + n].axis = V3{r[4 * n], r[4 * n + 1], r[4 * n + 2]};
+                factor[k + n].impulse = r[4 * n + 3];
+            }
+        }
+        const T h = numbers.data[6 * of];
+        const auto& g = d.groups.data[of];
+        const V none = V(T(0)), one = V(T(1));
+        const V3 nothing = V3{none, none, none};
+        FACTOR_NUMBERS
+        FACTOR_BEGIN
+        for (int k = 0; k <= segments; ++k) {
+            const V3 n = factor[k].axis;
+            const V rho = factor[k].impulse;
+            FACTOR_NODE
+            factor[k] = Factor{pd, po, q, s, l0, l1, l2, lt, nothing, none, n};
+            FACTOR_NEXT
+        }
+"""
+FACTORS_TEXT = """
+    struct Factor { V3 d, o, q; V s; V3 l0, l1, l2, lt, move; V impulse; V3 axis; };
+    constexpr int numbers_of = sizeof(Factor) / sizeof(V);
+    static_assert(sizeof(factors.data[0]) == numbers_of * sizeof(T), "");
+    auto factors_at = [&](int f) -> Factor* {
+        const long long whole = gathered.shape[0] / d.parts;
+        T* const from = gathered.data + d.fiber_part.data[f] * whole;
+        const auto over = (unsigned long long)from % sizeof(V);
+        return (Factor*)((char*)from + (over ? sizeof(V) - over : 0));
+    };
+    auto paces = [&](int lanes, const int* fiber) -> V {
+        V pace;
+        for (int l = 0; l < W; ++l) pace[l] = fiber_pace.data[fiber[l < lanes ? l : 0]];
+        return pace;
+    };
+    auto ready_factors = [&](int lanes, const int* fiber) __attribute__((noinline)) {
+        const int of = d.fiber_group.data[fiber[0]], segments = d.groups.data[of].segments;
+        Factor* const factor = factors_at(fiber[0]);
+        const V pace = paces(lanes, fiber);
+FACTORS_OF    };
+"""
+FILL = """
+    auto fill = [&](int lanes, const int* fiber, const int* row, const int* side,
+            T* const* columnKINDS) __attribute__((noinline)) {
+        const int of = d.fiber_group.data[fiber[0]];
+        const auto& group = d.groups.data[of];
+        const int segments = group.segments;
+        const T* const number = numbers.data + 6 * of;
+        const Factor* const factor = factors_at(fiber[0]);
+        const V pace = paces(lanes, fiber);
         const V h = pace * number[0], kappa = pace * number[1];
         const T drag_end = number[2], drag_inner = number[3];
         const V drag_off = V(number[4]);
@@ -191,7 +238,8 @@ LANE_SPIN
                 r[4 * n + 3] = there ? b[k + n] : V(T(0));
             }
             TURN
-            for (int l = 0; l < lanes; ++l) *(U*)(column[l] + 4 * k) = r[l];
+            for (int l = 0; l < lanes; ++l)
+                if (column[l] != nullptr) *(U*)(column[l] + 4 * k) = r[l];
         }
     };
 """
