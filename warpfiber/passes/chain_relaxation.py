@@ -69,63 +69,64 @@ COLUMNS = """
         fill(lanes, lane_fiber, lane_row, lane_side, columnAT_KIND);
         return column[0];
     };
-    // the first wanted ends of some fibers, one of each at a time
-    auto find_columns = [&](int lanes, const int* fiber) {
+    // of some fibers, as many as `ends` (2 r + side) of each: one of each at a time
+    struct Waiting { int held, fiber[W], ends[W], end[W][W]; };
+    static_assert(sizeof(Waiting) == WAITING * sizeof(int), "");
+    auto find_columns = [&](const Waiting& list) {
+        const int lanes = list.held;
         if (lanes == 0) return;
-        int held[W] = {0}, row[W][W], side[W][W], most = 0;
-        for (int l = 0; l < lanes; ++l) {
-            each_end(fiber[l], [&](int r, int at_side) {
-                if (held[l] == W || !is_wanted(r, at_side)) return;
-                row[held[l]][l] = r;
-                side[held[l]++][l] = at_side;
-            });
-            most = held[l] > most ? held[l] : most;
-        }
-        ready_factors(lanes, fiber);
+        int row[W], side[W], most = 0;
+        for (int l = 0; l < lanes; ++l) most = list.ends[l] > most ? list.ends[l] : most;
+        ready_factors(lanes, list.fiber);
         for (int n = 0; n < most; ++n) {
             T* column[W];
             for (int l = 0; l < lanes; ++l) {
-                column[l] = n < held[l] ? place_of(fiber[l], row[n][l], side[n][l]) : nullptr;
-                if (n >= held[l]) {
-                    row[n][l] = row[0][l];
-                    side[n][l] = side[0][l];
-                }
+                const bool there = n < list.ends[l];
+                const int end = list.end[l][there ? n : 0];
+                row[l] = end / 2;
+                side[l] = end % 2;
+                column[l] = there ? place_of(list.fiber[l], row[l], side[l]) : nullptr;
             }
-            fill(lanes, fiber, row[n], side[n], columnAT_KIND);
+            fill(lanes, list.fiber, row, side, columnAT_KIND);
         }
     };
-    // those that are likely to have a force
+    // those that are likely to have a force; at most W of a fiber
     if (stage == PARTS_STAGE) {
-        struct Waiting { int held, fiber[W]; };
-        static_assert(sizeof(Waiting) == WAITING * sizeof(int), "");
         const int groups = (int)d.groups.shape[0];
         Waiting* const waiting_of = (Waiting*)waiting.data + (long long)part * groups * W;
         for (int of = 0; of < groups * W; ++of) waiting_of[of].held = 0;
         for (int q = d.part_start.data[part]; q < d.part_start.data[part + 1]; ++q) {
             const int f = d.fiber_order.data[q];
             if (is_fixed(f)) continue;
-            int ends = 0;
-            each_end(f, [&](int r, int side) { ends += is_wanted(r, side); });
+            int ends = 0, end[W];
+            each_end(f, [&](int r, int side) {
+                if (ends < W && is_wanted(r, side)) end[ends++] = 2 * r + side;
+            });
             if (ends == 0) continue;
-            const int most = ends < W ? ends : W;
-            Waiting& list = waiting_of[d.fiber_group.data[f] * W + most - 1];
-            list.fiber[list.held++] = f;
-            if (list.held < W) continue;
-            find_columns(W, list.fiber);
+            Waiting& list = waiting_of[d.fiber_group.data[f] * W + ends - 1];
+            list.fiber[list.held] = f;
+            list.ends[list.held] = ends;
+            for (int n = 0; n < ends; ++n) list.end[list.held][n] = end[n];
+            if (++list.held < W) continue;
+            find_columns(list);
             list.held = 0;
         }
+        // what is left of the lists of a group together, most ends first
         for (int of = 0; of < groups; ++of) {
-            int rest[W], lanes = 0;
+            Waiting rest;
+            rest.held = 0;
             for (int n = W - 1; n >= 0; --n) {
                 const Waiting& list = waiting_of[of * W + n];
                 for (int k = 0; k < list.held; ++k) {
-                    rest[lanes++] = list.fiber[k];
-                    if (lanes < W) continue;
-                    find_columns(W, rest);
-                    lanes = 0;
+                    rest.fiber[rest.held] = list.fiber[k];
+                    rest.ends[rest.held] = list.ends[k];
+                    for (int e = 0; e < list.ends[k]; ++e) rest.end[rest.held][e] = list.end[k][e];
+                    if (++rest.held < W) continue;
+                    find_columns(rest);
+                    rest.held = 0;
                 }
             }
-            find_columns(lanes, rest);
+            find_columns(rest);
         }
     }
     auto push = [&](int f, int r, int side, T change) {
@@ -219,7 +220,7 @@ FRICTION = """
 
 def waiting_numbers(name: str) -> int:
     """Of a list of fibers that wait for each other."""
-    return 1 + LANES[name]
+    return 1 + (2 + LANES[name]) * LANES[name]
 
 
 @cache
