@@ -1,23 +1,31 @@
 """Which rows of contact pairs have, many pairs at a time: C++ text for `pair_motion`.
 
 Repeats `row_geometry.make_row_geometry` for what depends on two segments and their motion alone.
-What may depend on the segments beside them (a place near a joint), on radii that differ, or on
-bead pairs is marked LOOK and decided by `row_count`.
+Pairs for which the segments beside them count (a place near a joint) wait for each other and are
+decided by `native_row_joints`; what may depend on radii that differ, or on bead pairs, is marked
+LOOK and decided by `row_count`.
 
 Source: as there: closest points and four ends, those whose predicted gap is below `keep` and that
     no row nearby stands for.
 Symbols: as there; `settles`: radii are equal and nothing but predicted gaps decides.
 """
 
+from warpfiber.passes.native_row_joints import JOINTS
 from warpfiber.passes.pairs import END_TOLERANCE
 from warpfiber.passes.row_geometry import CLOSER, CROSSING
 
 LOOK = 128  # among the slots of a pair
+WAITS = 64  # the same, as long as it is not decided
 FIRST, LAST = 1, 2  # a segment begins, ends its fiber
 SLACK = 1e-4  # radii: where rounding may decide, the other kernel does
 
 TEXT = """
-    auto find_slots = [&](const int* pairs, int count) __attribute__((noinline)) {
+    int at_joints[2 * W], joints = 0;
+    struct Alone { enum { value = 0 }; };
+    struct ByJoints { enum { value = 1 }; };
+    // compiled for each of both
+    auto find_slots = [&](const int* pairs, int count, auto kind) __attribute__((noinline)) {
+        constexpr bool beside = decltype(kind)::value;
         const Motion m = motion_of(pairs);
         const V aa = larger(m.a.dot(m.a), least), bb = larger(m.b.dot(m.b), least);
         const V ab = m.a.dot(m.b), da = m.d.dot(m.a), db = m.d.dot(m.b);
@@ -78,6 +86,13 @@ TEXT = """
                 return (~begins & (s * length < arc))
                     | (~ends & (((T(1) - s) * length < arc) | (s >= T(1) - near)));
             };
+JOINTS
+            Beside by_i, by_j;
+            if (beside) {
+                by_i = beside_of(pair_i);
+                by_j = beside_of(pair_j);
+            }
+            M waits = V(T(0)) > V(T(1));
             const M has_first = ~(is_joint(places[0].s, first_i, last_i)
                                   | is_joint(places[0].t, first_j, last_j));
             bits = has_first & close[0] ? V(T(1)) : bits;
@@ -85,8 +100,17 @@ TEXT = """
             for (int k = 1; k < 3; ++k) {
                 M made = with_i[k - 1] & ~(has_first & same(places[k], places[0]));
                 made &= ~((places[k].t <= near) & ~first_j);
-                look |= made & by_joint(places[k].t, length_b, first_j, last_j);
-                if (k == 1) look |= made & ~last_i;
+                if (beside) {
+                    const V t = places[k].t;
+                    const V3 c = m.d + m.b * t - m.a * places[k].s;
+                    made &= is_nearest(t, c, m.b, length_b, by_j, first_j, last_j);
+                    if (k == 1)
+                        made &= last_i | ~is_beside_next(
+                            m.d - m.a, by_i, m.b, bb, length_b, t, first_j, last_j);
+                } else {
+                    waits |= made & by_joint(places[k].t, length_b, first_j, last_j);
+                    if (k == 1) waits |= made & ~last_i;
+                }
                 bits += made ? V(T(1 << k)) : V(T(0));
             }
             const M with_j[2] = {close[3], close[4] & first_j};
@@ -98,10 +122,20 @@ TEXT = """
                     made &= ~(same(places[k], places[other]) & stands);
                 }
                 made &= ~((places[k].s <= near) & ~first_i);
-                look |= made & by_joint(places[k].s, length_a, first_i, last_i);
-                if (k == 3) look |= made & ~last_j;
+                if (beside) {
+                    const V at = places[k].s;
+                    const V3 c = m.a * at - m.d - m.b * places[k].t;
+                    made &= is_nearest(at, c, m.a, length_a, by_i, first_i, last_i);
+                    if (k == 3)
+                        made &= last_j | ~is_beside_next(
+                            V3{} - m.d - m.b, by_j, m.a, aa, length_a, at, first_i, last_i);
+                } else {
+                    waits |= made & by_joint(places[k].s, length_a, first_i, last_i);
+                    if (k == 3) waits |= made & ~last_j;
+                }
                 bits += made ? V(T(1 << k)) : V(T(0));
             }
+            bits = waits ? V(T(WAITS)) : bits;
         } else {
             for (int k = 0; k < 5; ++k) look |= close[k] | (apart2[k] < damp * damp);
         }
@@ -109,6 +143,10 @@ TEXT = """
         for (int l = 0; l < count; ++l) {
             const int found = (int)bits[l];
             if (found == 0) continue;
+            if (found == WAITS) {
+                at_joints[joints++] = pairs[l];
+                continue;
+            }
             const int i = pair_i.data[pairs[l]];
             pair_slots.data[pairs[l]] = (unsigned char)found;
             if (found == LOOK) {
@@ -120,13 +158,24 @@ TEXT = """
             segment_rows.data[i] += made;
         }
     };
+    // a vector of those that wait, at the end what is left
+    auto find_joints = [&](bool all) {
+        while (joints >= W || (all && joints > 0)) {
+            const int count = joints < W ? joints : W;
+            for (int l = count; l < W; ++l) at_joints[l] = at_joints[count - 1];
+            joints -= count;
+            find_slots(at_joints, count, ByJoints{});
+            for (int l = 0; l < joints; ++l) at_joints[l] = at_joints[W + l];
+        }
+    };
 """
 
 
 def slots_text(name: str) -> str:
-    """`find_slots(pairs, count)`, in which `NONE` is the code of a pair that is no image."""
-    text = TEXT
+    """`find_slots(pairs, count, kind)`, `find_joints(all)`; `NONE`: a pair that is no image."""
+    text = TEXT.replace("JOINTS", JOINTS)
     for key, value in {
+        "WAITS": str(WAITS),
         "SLACK": repr(SLACK),
         "LOOK": str(LOOK),
         "FIRST": str(FIRST),
