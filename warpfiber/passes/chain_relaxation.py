@@ -1,8 +1,9 @@
 """Contact forces of flexible fibers on the CPU: rows relaxed one after the other.
 
 Source: `native_relaxation`; what a fiber does by a unit force at an end of a row (`native_blocks`),
-    a column, computed when the row first has a force, with those of other ends of the fiber that
-    are likely to have one. What does not fit `columns` is computed again whenever it is needed.
+    a column. Those of ends that are likely to have a force are computed first, of fibers all over
+    a part in vectors; others when the row first has a force. What does not fit `columns` is
+    computed again whenever it is needed.
 Symbols: `column_at` of an end (2 r + side), with friction also of its two directions in the plane
     (4 r + 2 side + c, behind those): where its column is, in vectors.
 """

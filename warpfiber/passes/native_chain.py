@@ -250,7 +250,10 @@ def chain_blocks(name: str, fiber_group: np.ndarray) -> np.ndarray:
 
 @cache
 def make_native_chain(name: str, loaded: bool = False) -> Any:
-    """Kernel `native_chain_step` over blocks: as `chain_step` of two stages; see its arguments."""
+    """Kernel `native_chain_step` over blocks: as `chain_step` of two stages; see its arguments.
+
+    `row_stride` 0: no rows are left; `axes_stride` > 0: axes of every node, see `native_factor`.
+    """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Group = group_struct(name)

