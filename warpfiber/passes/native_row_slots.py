@@ -15,7 +15,6 @@ from warpfiber.passes.pairs import END_TOLERANCE
 from warpfiber.passes.row_geometry import CLOSER, CROSSING
 
 LOOK = 128  # among the slots of a pair
-WAITS = 64  # the same, as long as it is not decided
 FIRST, LAST = 1, 2  # a segment begins, ends its fiber
 SLACK = 1e-4  # radii: where rounding may decide, the other kernel does
 
@@ -40,7 +39,7 @@ TEXT = """
         const T now_below = settles ? T(-1e20) : widest * (near_now + T(SLACK));
         const T damp = wet * (T(1) + T(SLACK));
         V apart2[5];
-        M close[5], look = V(T(0)) > V(T(1));
+        M close[5], look = V(T(0)) > V(T(1)), waits = look;
         for (int k = 0; k < 5; ++k) {
             const V s = places[k].s, t = places[k].t;
             const V3 c = m.d + m.b * t - m.a * s, moved = m.w + m.wb * t - m.wa * s;
@@ -92,7 +91,6 @@ JOINTS
                 by_i = beside_of(pair_i);
                 by_j = beside_of(pair_j);
             }
-            M waits = V(T(0)) > V(T(1));
             const M has_first = ~(is_joint(places[0].s, first_i, last_i)
                                   | is_joint(places[0].t, first_j, last_j));
             bits = has_first & close[0] ? V(T(1)) : bits;
@@ -135,18 +133,17 @@ JOINTS
                 }
                 bits += made ? V(T(1 << k)) : V(T(0));
             }
-            bits = waits ? V(T(WAITS)) : bits;
+            bits = waits ? V(T(0)) : bits;
         } else {
             for (int k = 0; k < 5; ++k) look |= close[k] | (apart2[k] < damp * damp);
         }
+        waits &= ~look;
+        for (int l = 0; l < count; ++l)
+            if (waits[l]) at_joints[joints++] = pairs[l];
         bits = look ? V(T(LOOK)) : bits;
         for (int l = 0; l < count; ++l) {
             const int found = (int)bits[l];
             if (found == 0) continue;
-            if (found == WAITS) {
-                at_joints[joints++] = pairs[l];
-                continue;
-            }
             const int i = pair_i.data[pairs[l]];
             pair_slots.data[pairs[l]] = (unsigned char)found;
             if (found == LOOK) {
@@ -175,7 +172,6 @@ def slots_text(name: str) -> str:
     """`find_slots(pairs, count, kind)`, `find_joints(all)`; `NONE`: a pair that is no image."""
     text = TEXT.replace("JOINTS", JOINTS)
     for key, value in {
-        "WAITS": str(WAITS),
         "SLACK": repr(SLACK),
         "LOOK": str(LOOK),
         "FIRST": str(FIRST),
