@@ -28,6 +28,7 @@ from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Executor, Launch
 from warpfiber.passes.held_nodes import make_carry_fibers
 from warpfiber.passes.native_chain import MOST_NODES, chain_blocks, make_native_chain
+from warpfiber.passes.native_factor import axes_stride
 from warpfiber.scene import Scene
 
 # Fibers per block of lanes from which vectors pay: a block costs 175 ns per node and solve, a fiber
@@ -62,10 +63,26 @@ class Overdamped(Implicit):
         # the guess of the first step is the start: nothing is known of the velocity
         state.node_velocity.zero_()
         self.fiber_pace = wp.full(model.fiber_count, p.real(1.0), p.real, device=device)
+        # vectors know neither held nodes nor fibers that are carried whole
+        self.native = device.startswith("cpu") and self.stages == 2 and most <= MOST_NODES
+        self.native = self.native and self.node_hold.shape[0] == 0
+        blocks = chain_blocks(p.name, model.host["fiber_group"])
+        self.native = self.native and model.fiber_count >= FILLED * (len(blocks) - 1)
+        # what factors are found by again, where nothing but a solve for contact asks for them
+        self.axes_stride = 0
+        if self.native and self.meets and not model.starts_bent:
+            self.axes_stride = axes_stride(p.name, most)
+        size = self.axes_stride * model.fiber_count
+        self.axes = wp.zeros(size, dtype=p.real, device=device)
         self.load: ChainLoad | None = None
         if self.meets:
             response = ChainResponse(
-                model, self.rows, self.row_stride, self.tension, fiber_pace=self.fiber_pace
+                model,
+                self.rows,
+                self.row_stride,
+                self.tension,
+                fiber_pace=self.fiber_pace,
+                axes=self.axes,
             )
             # others hold bent what is packed; straight fibers would carry the load to no use
             if model.starts_bent:
@@ -74,11 +91,6 @@ class Overdamped(Implicit):
         # packed fibers near the load at which they buckle would answer contact without bounds
         self.clips = self.contact is not None and self.contact.packed
         self.paced = self.clips
-        # vectors know neither held nodes nor fibers that are carried whole
-        self.native = device.startswith("cpu") and self.stages == 2 and most <= MOST_NODES
-        self.native = self.native and self.node_hold.shape[0] == 0
-        blocks = chain_blocks(p.name, model.host["fiber_group"])
-        self.native = self.native and model.fiber_count >= FILLED * (len(blocks) - 1)
         self.block_start = wp.array(blocks, dtype=wp.int32, device=device)
 
     # -- the step ---------------------------------------------------------------------------------
@@ -158,7 +170,8 @@ class Overdamped(Implicit):
             self.block_start,
             self._kept(),
             1 if self.clips else 0,
-            self.row_stride,
+            0 if self.axes_stride > 0 else self.row_stride,
+            self.axes_stride,
             p.vec3(*self.flow_origin),
             self.step_size,
             self.fiber_pace,
@@ -167,6 +180,7 @@ class Overdamped(Implicit):
             model.fiber_node_start,
             model.fiber_group,
             self.rows,
+            self.axes,
             state.node_pos,
             state.node_velocity,
             self.tension,
@@ -267,5 +281,6 @@ def overdamped_bytes(nodes: int, segments: int, real: int, adaptive: bool) -> in
 
     On the CPU the rows, by far the largest, are allocated but hardly touched.
     """
-    per_node = 29 + 3 + (6 if adaptive else 0)  # a row of the elimination, motion, kept state
+    # a row of the elimination or axes instead, motion, kept state
+    per_node = 29 + 4 + 3 + (6 if adaptive else 0)
     return real * (nodes * per_node + 2 * segments)

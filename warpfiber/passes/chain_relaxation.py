@@ -1,8 +1,9 @@
 """Contact forces of flexible fibers on the CPU: rows relaxed one after the other.
 
 Source: `native_relaxation`; what a fiber does by a unit force at an end of a row (`native_blocks`),
-    a column, computed when the row first has a force, with those of other ends of the fiber that
-    are likely to have one. What does not fit `columns` is computed again whenever it is needed.
+    a column. Those of ends that are likely to have a force are computed first, of fibers all over
+    a part in vectors; others when the row first has a force. What does not fit `columns` is
+    computed again whenever it is needed.
 Symbols: `column_at` of an end (2 r + side), with friction also of its two directions in the plane
     (4 r + 2 side + c, behind those): where its column is, in vectors.
 """
@@ -17,7 +18,7 @@ from warpfiber.passes.chain_reply import make_reply_numbers
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.native import LANES, lane_types
 from warpfiber.passes.native_blocks import fill_text
-from warpfiber.passes.native_relaxation import BEGIN, relaxation_text
+from warpfiber.passes.native_relaxation import BEGIN, PARTS, relaxation_text
 from warpfiber.passes.relaxation_work import make_relaxation_begin, relaxation_struct
 
 REPLY_NUMBERS = 6  # of every group, see `chain_reply.make_reply_numbers`
@@ -34,35 +35,101 @@ RESET_FRICTION    };
     if (stage == ROWS_STAGE) part_used.data[part] = 0;
 """
 
+# Fibers of one group with as many wanted ends wait for each other.
 COLUMNS = """
     const long long room = columns.shape[0] / d.parts / W * W;
+    auto is_wanted = [&](int r, int side) -> bool {
+        const Row& row = rows[r];
+        return (row.force != T(0) || row.normal[3] < T(0)) && column_at.data[2 * r + side] < 0;
+    };
+    // a place for a column, if there is room
+    auto place_of = [&](int f, int r, int side) -> T* {
+        const int of = d.fiber_part.data[f], size = size_of(f);
+        if (part_used.data[of] + size > room) return nullptr;
+        const long long at = of * room + part_used.data[of];
+        column_at.data[2 * r + side] = (int)(at / W);
+        part_used.data[of] += size;
+        return columns.data + at;
+    };
     auto column_of = [&](int f, int r, int side) -> const T* {
         int& at = column_at.data[2 * r + side];
         if (at >= 0) return columns.data + (long long)W * at;
-        const int size = size_of(f), of = d.fiber_part.data[f];
-        const long long used = part_used.data[of], left = (room - used) / size;
-        int lane_row[W] = {r}, lane_side[W] = {side}, lanes = 1;
-        if (left < 1) {
-            T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-            fill(f, 1, lane_row, lane_side, ownAT_KIND);
-            return own;
-        }
+        int lane_fiber[W] = {f}, lane_row[W] = {r}, lane_side[W] = {side}, lanes = 1;
+        T* column[W] = {place_of(f, r, side)};
+        const bool fits = column[0] != nullptr;
+        if (!fits) column[0] = spare.data + d.fiber_part.data[f] * (spare.shape[0] / d.parts);
         each_end(f, [&](int other, int at_side) {
-            if (lanes == W || lanes == left || (other == r && at_side == side)) return;
-            const Row& row = rows[other];
-            if (row.force == T(0) && !(row.normal[3] < T(0))) return;
-            if (column_at.data[2 * other + at_side] >= 0) return;
+            if (!fits || lanes == W || !is_wanted(other, at_side)) return;
+            column[lanes] = place_of(f, other, at_side);
+            if (column[lanes] == nullptr) return;
+            lane_fiber[lanes] = f;
             lane_row[lanes] = other;
             lane_side[lanes++] = at_side;
         });
-        T* const own = columns.data + of * room + used;
-        fill(f, lanes, lane_row, lane_side, ownAT_KIND);
-        for (int l = 0; l < lanes; ++l)
-            column_at.data[2 * lane_row[l] + lane_side[l]] =
-                (int)((of * room + used + (long long)l * size) / W);
-        part_used.data[of] = used + (long long)lanes * size;
-        return own;
+        ready_factors(lanes, lane_fiber);
+        fill(lanes, lane_fiber, lane_row, lane_side, columnAT_KIND);
+        return column[0];
     };
+    // of some fibers, as many as `ends` (2 r + side) of each: one of each at a time
+    struct Waiting { int held, fiber[W], ends[W], end[W][W]; };
+    static_assert(sizeof(Waiting) == WAITING * sizeof(int), "");
+    auto find_columns = [&](const Waiting& list) {
+        const int lanes = list.held;
+        if (lanes == 0) return;
+        int row[W], side[W], most = 0;
+        for (int l = 0; l < lanes; ++l) most = list.ends[l] > most ? list.ends[l] : most;
+        ready_factors(lanes, list.fiber);
+        for (int n = 0; n < most; ++n) {
+            T* column[W];
+            for (int l = 0; l < lanes; ++l) {
+                const bool there = n < list.ends[l];
+                const int end = list.end[l][there ? n : 0];
+                row[l] = end / 2;
+                side[l] = end % 2;
+                column[l] = there ? place_of(list.fiber[l], row[l], side[l]) : nullptr;
+            }
+            fill(lanes, list.fiber, row, side, columnAT_KIND);
+        }
+    };
+    // those that are likely to have a force; at most W of a fiber
+    if (stage == PARTS_STAGE) {
+        const int groups = (int)d.groups.shape[0];
+        Waiting* const waiting_of = (Waiting*)waiting.data + (long long)part * groups * W;
+        for (int of = 0; of < groups * W; ++of) waiting_of[of].held = 0;
+        for (int q = d.part_start.data[part]; q < d.part_start.data[part + 1]; ++q) {
+            const int f = d.fiber_order.data[q];
+            if (is_fixed(f)) continue;
+            int ends = 0, end[W];
+            each_end(f, [&](int r, int side) {
+                if (ends < W && is_wanted(r, side)) end[ends++] = 2 * r + side;
+            });
+            if (ends == 0) continue;
+            Waiting& list = waiting_of[d.fiber_group.data[f] * W + ends - 1];
+            list.fiber[list.held] = f;
+            list.ends[list.held] = ends;
+            for (int n = 0; n < ends; ++n) list.end[list.held][n] = end[n];
+            if (++list.held < W) continue;
+            find_columns(list);
+            list.held = 0;
+        }
+        // what is left of the lists of a group together, most ends first
+        for (int of = 0; of < groups; ++of) {
+            Waiting rest;
+            rest.held = 0;
+            for (int n = W - 1; n >= 0; --n) {
+                const Waiting& list = waiting_of[of * W + n];
+                for (int k = 0; k < list.held; ++k) {
+                    rest.fiber[rest.held] = list.fiber[k];
+                    rest.ends[rest.held] = list.ends[k];
+                    for (int e = 0; e < list.ends[k]; ++e) rest.end[rest.held][e] = list.end[k][e];
+                    if (++rest.held < W) continue;
+                    find_columns(rest);
+                    rest.held = 0;
+                }
+            }
+            find_columns(rest);
+        }
+    }
     auto push = [&](int f, int r, int side, T change) {
         const T* const column = column_of(f, r, side);
         T* const mine = motion + d.fiber_at.data[f];
@@ -120,9 +187,12 @@ FRICTION = """
         const int size = size_of(f), of = d.fiber_part.data[f];
         const long long used = part_used.data[of], left = (room - used) / size;
         int lane_row[W] = {r}, lane_side[W] = {side}, lane_kind[W] = {1 + c}, lanes = 1;
+        int lane_fiber[W];
+        for (int l = 0; l < W; ++l) lane_fiber[l] = f;
         if (left < 1) {
             T* const own = spare.data + (long long)of * (spare.shape[0] / d.parts);
-            fill(f, 1, lane_row, lane_side, own, lane_kind);
+            ready_factors(1, lane_fiber);
+            fill(1, lane_fiber, lane_row, lane_side, &own, lane_kind);
             return own;
         }
         each_end(f, [&](int other, int at_side) {
@@ -136,28 +206,41 @@ FRICTION = """
                 lane_kind[lanes++] = 1 + k;
             }
         });
-        T* const own = columns.data + of * room + used;
-        fill(f, lanes, lane_row, lane_side, own, lane_kind);
+        T* column[W];
+        for (int l = 0; l < lanes; ++l) column[l] = columns.data + of * room + used + l * size;
+        ready_factors(lanes, lane_fiber);
+        fill(lanes, lane_fiber, lane_row, lane_side, column, lane_kind);
         for (int l = 0; l < lanes; ++l)
             place(lane_row[l], lane_side[l], lane_kind[l] - 1) =
                 (int)((of * room + used + (long long)l * size) / W);
         part_used.data[of] = used + (long long)lanes * size;
-        return own;
+        return column[0];
     };
 """
 
 
+def waiting_numbers(name: str) -> int:
+    """Of a list of fibers that wait for each other."""
+    return 1 + (2 + LANES[name]) * LANES[name]
+
+
 @cache
 def make_chain_relaxation(
-    name: str, law: str, module: str = "unique", friction: bool = False
+    name: str, law: str, module: str = "unique", friction: bool = False, found: bool = False
 ) -> Any:
-    """Kernel `chain_relax` (see `native_relaxation` for its stages): forces, shifts, impulses."""
+    """Kernel `chain_relax` (see `native_relaxation` for its stages): forces, shifts, impulses.
+
+    `found`: there are no factors but `axes` (`native_factor`).
+    """
     real = precision(name).real
     Relaxation = relaxation_struct(name)
     Factor = elimination_row(name)
     begin_solve = make_relaxation_begin(name)
     reply_numbers = make_reply_numbers(name)
-    fibers = SIZES + fill_text(LANES[name], friction) + (NORMALS if friction else "") + COLUMNS
+    filled = fill_text(LANES[name], friction, found)
+    fibers = SIZES + filled + (NORMALS if friction else "") + COLUMNS
+    fibers = fibers.replace("WAITING", str(waiting_numbers(name)))
+    fibers = fibers.replace("PARTS_STAGE", str(PARTS))
     fibers = fibers.replace("AT_KIND", ", along_normal" if friction else "")
     fibers = fibers.replace("RESET_FRICTION", RESET if friction else "")
     rubs = FRICTION if friction else None
@@ -170,11 +253,14 @@ def make_chain_relaxation(
         row_stride: wp.int32,
         fiber_pace: wp.array(dtype=real),
         factors: wp.array(dtype=Factor),
+        axes: wp.array(dtype=real),
         numbers: wp.array(dtype=real),
         column_at: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=real),
         part_used: wp.array(dtype=wp.int64),
         spare: wp.array(dtype=real),
+        gathered: wp.array(dtype=real),
+        waiting: wp.array(dtype=wp.int32),
         segment_impulse: wp.array(dtype=real),
     ): ...
 
@@ -187,11 +273,14 @@ def make_chain_relaxation(
         step_size: wp.array(dtype=wp.float64),
         fiber_pace: wp.array(dtype=real),
         factors: wp.array(dtype=Factor),
+        axes: wp.array(dtype=real),
         numbers: wp.array(dtype=real),
         column_at: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=real),
         part_used: wp.array(dtype=wp.int64),
         spare: wp.array(dtype=real),
+        gathered: wp.array(dtype=real),
+        waiting: wp.array(dtype=wp.int32),
         segment_impulse: wp.array(dtype=real),
     ):
         if stage == wp.static(BEGIN):
@@ -217,11 +306,14 @@ def make_chain_relaxation(
             row_stride,
             fiber_pace,
             factors,
+            axes,
             numbers,
             column_at,
             columns,
             part_used,
             spare,
+            gathered,
+            waiting,
             segment_impulse,
         )
 

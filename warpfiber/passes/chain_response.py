@@ -11,13 +11,17 @@ import warp as wp
 
 from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.chain_blocks import make_chain_moves, make_end_kernels
-from warpfiber.passes.chain_relaxation import REPLY_NUMBERS, make_chain_relaxation
+from warpfiber.passes.chain_relaxation import (
+    REPLY_NUMBERS,
+    make_chain_relaxation,
+    waiting_numbers,
+)
 from warpfiber.passes.chain_reply import make_chain_reply, make_gather_push
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.elimination import elimination_row
 from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.native import LANES
-from warpfiber.passes.native_blocks import MOST_NODES
+from warpfiber.passes.native_blocks import FACTORS, MOST_NODES
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
 from warpfiber.passes.rub_response import make_chain_rub, rub_clear, rub_rows
@@ -167,6 +171,7 @@ class ChainResponse:
     rows, row_stride: factors of every fiber, as `chain_solve` left them (row_stride > 0).
     block_share: numbers per end in `block`, the ends that a fiber may have on average.
     fiber_pace: see `chain_pace`; 1 unless given.
+    axes: instead of factors, see `native_factor`; only where it relaxes.
     parts: into which a relaxation cuts the cell; by its size unless given.
     """
 
@@ -181,6 +186,7 @@ class ChainResponse:
         block_share: int | None = None,
         fiber_pace: Any = None,
         parts: int | None = None,
+        axes: Any = None,
     ) -> None:
         most = max(row["segments"] for row in model.group_rows)
         self.relaxes = model.device.startswith("cpu") and most < MOST_NODES
@@ -195,6 +201,7 @@ class ChainResponse:
         self.segment_impulse = self._array(model.segment_count, p.real)
         self.end_start = self._array(model.fiber_count + 1, wp.int32)
         self.block_start = self._array(model.fiber_count, wp.int32)
+        self.axes = self._array(0, p.real) if axes is None else axes
         self._allocate(0, 0)
         self.column_at = self._array(0, wp.int32)
 
@@ -327,7 +334,7 @@ class ChainResponse:
         nodes = np.diff(model.host["fiber_node_start"])
         sizes = -(-4 * nodes // lanes) * lanes
         work = relaxation_work(dual, self.end_start, sizes, self.parts)
-        most, parts = int(sizes.max()), work.parts
+        most, parts, groups = int(sizes.max()), work.parts, len(model.group_rows)
         # as much as there may be: what the rows of a step do not need stays out of memory
         share = most * parts if self.block_share is None else self.block_share
         columns = 3 * ends if dual.rubs else ends
@@ -339,14 +346,18 @@ class ChainResponse:
             dual.step_size,
             self.fiber_pace,
             self.rows,
-            self._array(REPLY_NUMBERS * len(model.group_rows), p.real),
+            self.axes,
+            self._array(REPLY_NUMBERS * groups, p.real),
             self.column_at,
             self.block,
             self._array(parts, wp.int64),
             self._array(most * parts, p.real),
+            self._array(parts * lanes * (FACTORS * int(nodes.max()) + 1), p.real),
+            self._array(parts * groups * lanes * waiting_numbers(p.name), wp.int32),
             self.segment_impulse,
         ]
-        kernel = make_chain_relaxation(p.name, dual.law.kind, friction=dual.rubs)
+        found = self.axes.shape[0] > 0
+        kernel = make_chain_relaxation(p.name, dual.law.kind, friction=dual.rubs, found=found)
         return [*relaxation_launches(kernel, work, inputs)]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:

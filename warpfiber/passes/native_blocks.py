@@ -11,25 +11,31 @@ Limits: CPU only; fibers of up to MOST_NODES nodes (stack); sums are in another 
 
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.native import transpose
+from warpfiber.passes.native_factor import FACTOR_TEXTS
 
 MOST_NODES = 512
+FACTORS = 29  # numbers of a node
 
 
-# `fill(f, lanes, row, side, column)`: columns of the ends `side` of `row`, one behind the other,
-# of size_of(f) numbers each. With friction `kind` behind: 0 along the normal, 1 and 2 along the
-# directions of the plane. `turn(v)` transposes W vectors.
-def fill_text(lanes: int, friction: bool = False) -> str:
-    """C++ text of `fill`."""
+# `ready_factors(lanes, fiber)`: of fibers of one group, then
+# `fill(lanes, fiber, row, side, column)`: columns of the ends `side` of `row` on these fibers, of
+# lanes whose `column` is somewhere.
+# With friction `kind` behind: 0 along the normal, 1 and 2 along the directions of the plane.
+# `turn(v)` transposes W vectors.
+def fill_text(lanes: int, friction: bool = False, found: bool = False) -> str:
+    """C++ text; `found`: factors are found again by axes (`native_factor`), not read."""
     parts = {
         "KINDS": ", const int* kind" if friction else "",
         "LANE_PUSH": PULLS if friction else PUSHES,
         "NODE_PUSH": PULLED if friction else PUSHED,
         "LANE_SPIN": SPUN if friction else "",
         "CHI": repr(CHI),
+        "FACTORS_OF": FOUND if found else GATHERED,
+        **FACTOR_TEXTS,
         "TURN": transpose(lanes),
         "MOST_NODES": str(MOST_NODES),
     }
-    text = FILL
+    text = FACTORS_TEXT + FILL
     for key, value in parts.items():
         text = text.replace(key, value)
     return text
@@ -40,7 +46,7 @@ PUSHES = """
         for (int l = 0; l < lanes; ++l) {
             const Row& from = rows[row[l]];
             const bool own = side[l] == 0;
-            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
+            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[fiber[l]]) / 4);
             share[l] = own ? from.s : from.t;
             push.x[l] = own ? -from.normal[0] : from.normal[0];
             push.y[l] = own ? -from.normal[1] : from.normal[1];
@@ -58,7 +64,7 @@ PULLS = """
         for (int l = 0; l < lanes; ++l) {
             const Row& from = rows[row[l]];
             const bool own = side[l] == 0;
-            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[f]) / 4);
+            at[l] = T(((own ? from.at_i : from.at_j) - d.fiber_at.data[fiber[l]]) / 4);
             const T part = own ? from.s : from.t;
             Pull pull = {own ? -from.normal : from.normal, Q{T(0), T(0), T(0), T(0)}, T(0)};
             const Rub& rub = rubs[row[l]];
@@ -75,8 +81,8 @@ PULLS = """
             far.z[l] = behind[2];
         }"""
 PULLED = """
-                const V first = at == V(T(k)) ? V(h) : V(T(0));
-                const V second = at == V(T(k - 1)) ? V(h) : V(T(0));
+                const V first = at == V(T(k)) ? h : V(T(0));
+                const V second = at == V(T(k - 1)) ? h : V(T(0));
                 V3 r = near * first + far * second;"""
 # Angle of the fiber about its axis, in place of the impulse before its first node.
 SPUN = """
@@ -84,31 +90,90 @@ SPUN = """
         b[0] = torque * (h / (T(CHI) * group.torque * carried));"""
 
 
+# Of every node in turn, from the rows of `chain_solve`, W numbers of all lanes at a time.
+GATHERED = """
+        for (int k = 0; k <= segments; ++k) {
+            const T* from[W];
+            for (int l = 0; l < W; ++l)
+                from[l] = (const T*)(factors.data
+                    + (long long)row_stride * fiber[l < lanes ? l : 0] + k);
+            for (int next = 0; next < numbers_of; next += W) {
+                const int first = next < numbers_of - W ? next : numbers_of - W;
+                V r[W];
+                for (int l = 0; l < W; ++l) r[l] = *(const U*)(from[l] + first);
+                TURN
+                for (int n = 0; n < W; ++n) ((V*)(factor + k))[first + n] = r[n];
+            }
+        }
+"""
+FOUND = """
+        const long long stride = (4 * row_stride + W - 1) / W * W;
+        for (int k = 0; k <= segments; k += W / 4) {
+            V r[W];
+            for (int l = 0; l < W; ++l)
+                r[l] = *(const U*)(axes.data + stride * fiber[l < lanes ? l : 0] + 4 * k);
+            TURN
+            for (int n = 0; n < W / 4 && k + n <= segments; ++n) {
+                factor[k + n].axis = V3{r[4 * n], r[4 * n + 1], r[4 * n + 2]};
+                factor[k + n].impulse = r[4 * n + 3];
+            }
+        }
+        const T h = numbers.data[6 * of];
+        const auto& g = d.groups.data[of];
+        const V none = V(T(0)), one = V(T(1));
+        const V3 nothing = V3{none, none, none};
+        FACTOR_NUMBERS
+        FACTOR_BEGIN
+        for (int k = 0; k <= segments; ++k) {
+            const V3 n = factor[k].axis;
+            const V rho = factor[k].impulse;
+            FACTOR_NODE
+            factor[k] = Factor{pd, po, q, s, l0, l1, l2, lt, nothing, none, n};
+            FACTOR_NEXT
+        }
+"""
+FACTORS_TEXT = """
+    struct Factor { V3 d, o, q; V s; V3 l0, l1, l2, lt, move; V impulse; V3 axis; };
+    constexpr int numbers_of = sizeof(Factor) / sizeof(V);
+    static_assert(sizeof(factors.data[0]) == numbers_of * sizeof(T), "");
+    auto factors_at = [&](int f) -> Factor* {
+        const long long whole = gathered.shape[0] / d.parts;
+        T* const from = gathered.data + d.fiber_part.data[f] * whole;
+        const auto over = (unsigned long long)from % sizeof(V);
+        return (Factor*)((char*)from + (over ? sizeof(V) - over : 0));
+    };
+    auto paces = [&](int lanes, const int* fiber) -> V {
+        V pace;
+        for (int l = 0; l < W; ++l) pace[l] = fiber_pace.data[fiber[l < lanes ? l : 0]];
+        return pace;
+    };
+    auto ready_factors = [&](int lanes, const int* fiber) __attribute__((noinline)) {
+        const int of = d.fiber_group.data[fiber[0]], segments = d.groups.data[of].segments;
+        Factor* const factor = factors_at(fiber[0]);
+        const V pace = paces(lanes, fiber);
+FACTORS_OF    };
+"""
 FILL = """
-    auto fill = [&](int f, int lanes, const int* row, const int* side, T* columnKINDS)
-            __attribute__((noinline)) {
-        const int node = d.fiber_node_start.data[f];
-        const int segments = d.fiber_node_start.data[f + 1] - node - 1;
-        const int base = row_stride * f, of = d.fiber_group.data[f];
-        const T* const number = numbers.data + 6 * of;
-        const T pace = fiber_pace.data[f];
-        const T h = pace * number[0], kappa = pace * number[1];
-        const T drag_end = number[2], drag_inner = number[3];
-        const T drag_off = number[4], strength = number[5];
+    auto fill = [&](int lanes, const int* fiber, const int* row, const int* side,
+            T* const* columnKINDS) __attribute__((noinline)) {
+        const int of = d.fiber_group.data[fiber[0]];
         const auto& group = d.groups.data[of];
+        const int segments = group.segments;
+        const T* const number = numbers.data + 6 * of;
+        const Factor* const factor = factors_at(fiber[0]);
+        const V pace = paces(lanes, fiber);
+        const V h = pace * number[0], kappa = pace * number[1];
+        const T drag_end = number[2], drag_inner = number[3];
+        const V drag_off = V(number[4]);
+        const T strength = number[5];
         const T weight = group.weight, weight_excess = group.weight_excess;
         V3 z[MOST_NODES];
         V b[MOST_NODES];
-        auto times = [&](const auto& row, const V3& v) -> V3 {
-            const auto& d = row.diagonal;
-            const auto& o = row.off;
-            return V3{d[0] * v.x + o[0] * v.y + o[1] * v.z, o[0] * v.x + d[1] * v.y + o[2] * v.z,
-                      o[1] * v.x + o[2] * v.y + d[2] * v.z};
+        auto times = [](const Factor& row, const V3& v) -> V3 {
+            const V3 &d = row.d, &o = row.o;
+            return V3{d.x * v.x + o.x * v.y + o.y * v.z, o.x * v.x + d.y * v.y + o.z * v.z,
+                      o.y * v.x + o.z * v.y + d.z * v.z};
         };
-        auto along = [](const auto& u, const V3& v) -> V {
-            return u[0] * v.x + u[1] * v.y + u[2] * v.z;
-        };
-        auto same = [](const auto& u) -> V3 { return V3{V(u[0]), V(u[1]), V(u[2])}; };
         const V3 none = same3(T(0), T(0), T(0));
         V at = V(T(-9)), share = V(T(0));LANE_PUSH
         for (int again = 0; again < 2; ++again) {
@@ -116,54 +181,53 @@ FILL = """
             V yt1 = V(T(0));
             if (again == 1) z1 = z[0];
             for (int k = 0; k <= segments; ++k) {
-                const auto& row = factors.data[base + k];
+                const Factor& row = factor[k];
 NODE_PUSH
                 if (again == 1) {
-                    const T drag = k == 0 || k == segments ? drag_end : drag_inner;
-                    r = r + z1 * V(drag) + z0 * V(drag_off) + couple;
+                    const V drag = V(k == 0 || k == segments ? drag_end : drag_inner);
+                    r = r + z1 * drag + z0 * drag_off + couple;
                     if (k < segments) {
                         const V3 z2 = z[k + 1], turn = z2 - z1;
                         const T s = strength * (weight + (k == 0 ? weight_excess : T(0))
                             + (k == segments - 1 ? weight_excess : T(0)));
-                        couple = (turn - same(row.axis) * along(row.axis, turn)) * V(s);
-                        r = r + z2 * V(drag_off) - couple;
+                        couple = (turn - row.axis * row.axis.dot(turn)) * V(s);
+                        r = r + z2 * drag_off - couple;
                         z0 = z1;
                         z1 = z2;
                     }
                 }
-                V3 y = r - V3{along(row.l0, y1), along(row.l1, y1), along(row.l2, y1)};
-                y = y - same(row.lt) * yt1 - v2 * V(kappa);
-                const V yt = k == 0 ? V(T(0)) : along(factors.data[base + k - 1].axis, v1);
+                V3 y = r - V3{row.l0.dot(y1), row.l1.dot(y1), row.l2.dot(y1)};
+                y = y - row.lt * yt1 - v2 * kappa;
+                const V yt = k == 0 ? V(T(0)) : factor[k - 1].axis.dot(v1);
                 v2 = v1;
-                v1 = times(row, y) + same(row.q) * yt;
+                v1 = times(row, y) + row.q * yt;
                 z[k] = v1;
-                b[k] = along(row.q, y) + yt * row.s;
+                b[k] = row.q.dot(y) + yt * row.s;
                 y1 = y;
                 yt1 = yt;
             }
             V3 behind = none, beyond = none;
             V impulse = V(T(0));
             for (int k = segments; k >= 0; --k) {
-                const auto& row = factors.data[base + k];
+                const Factor& row = factor[k];
                 V3 p = none;
-                if (k < segments) p = same(row.axis) * impulse - beyond * V(kappa);
+                if (k < segments) p = row.axis * impulse - beyond * kappa;
                 V3 x = z[k] + times(row, p);
-                V whole = b[k] + along(row.q, p);
+                V pulled = b[k] + row.q.dot(p);
                 if (k < segments) {
-                    const auto& next = factors.data[base + k + 1];
-                    x = x - same(next.l0) * behind.x - same(next.l1) * behind.y
-                        - same(next.l2) * behind.z;
-                    whole = whole - along(next.lt, behind);
+                    const Factor& next = factor[k + 1];
+                    x = x - next.l0 * behind.x - next.l1 * behind.y - next.l2 * behind.z;
+                    pulled = pulled - next.lt.dot(behind);
                 }
-                impulse = whole;
+                impulse = pulled;
                 beyond = behind;
                 behind = x;
                 z[k] = x;
-                b[k] = whole;
+                b[k] = pulled;
             }
         }
 LANE_SPIN
-        const int size = size_of(f);
+        const int size = size_of(fiber[0]);
         for (int k = 0; 4 * k < size; k += W / 4) {
             V r[W];
             for (int n = 0; n < W / 4; ++n) {
@@ -174,7 +238,8 @@ LANE_SPIN
                 r[4 * n + 3] = there ? b[k + n] : V(T(0));
             }
             TURN
-            for (int l = 0; l < lanes; ++l) *(U*)(column + (long long)l * size + 4 * k) = r[l];
+            for (int l = 0; l < lanes; ++l)
+                if (column[l] != nullptr) *(U*)(column[l] + 4 * k) = r[l];
         }
     };
 """

@@ -17,14 +17,15 @@ import warp as wp
 from warpfiber.model import BAD_FIBER, HALT, TORN, precision
 from warpfiber.passes.chain_solve import CHI
 from warpfiber.passes.elimination import elimination_row
-from warpfiber.passes.native import LANES, lane_types
+from warpfiber.passes.native import LANES, lane_types, transpose
+from warpfiber.passes.native_factor import FACTOR_TEXTS
 from warpfiber.passes.nodes import TEAR_STRETCH
 from warpfiber.passes.precision import group_struct
 
 MOST_NODES = 64
 
 STEP = """
-    struct Node { V3 d, o, q, l0, l1, l2, lt, move, n; V s, impulse; };
+    struct Node { V3 d, o, q, l0, l1, l2, lt, move, n; V s, impulse, rho; };
     static_assert(sizeof(rows.data[0]) == 29 * sizeof(T), "");
     Node stored[MOST_NODES];
     V3 position[MOST_NODES], motion[MOST_NODES], load[MOST_NODES];
@@ -62,16 +63,7 @@ STEP = """
         tension_back.data[i] = tension.data[i];
 
     const T dt = T(step_size.data[0]), h = T(CHI) * dt;
-    const V h_force = pace * h, kappa = h_force * (g.bending / (g.rest * g.rest));
-    const V compliance = V(g.compliance) / h_force, kappa2 = kappa * kappa;
-    const T end = (g.spacing + T(1)) * (T(2) * g.spacing + T(1)) / (T(6) * g.spacing);
-    const T drag_end = g.drag * end, drag_inner = g.drag * (T(2) * end - T(1));
-    const V drag_off = V(g.drag * g.coupling);
-    auto sym = [](const V3& d, const V3& o, const V3& v) -> V3 {
-        return V3{d.x * v.x + o.x * v.y + o.y * v.z, o.x * v.x + d.y * v.y + o.z * v.z,
-                  o.y * v.x + o.z * v.y + d.z * v.z};
-    };
-    M clipped = M(clips != 0 ? -1 : 0);
+FACTOR_NUMBERS    M clipped = M(clips != 0 ? -1 : 0);
     V longest = none, furthest = none;
     for (int stage = 0; stage < 2;) {
         const V a = V(stage == 0 ? h : T(1.0 / CHI)), b = V(stage == 0 ? h : T(1));
@@ -94,12 +86,10 @@ STEP = """
         };
         V3 x0 = guess(0), x1 = guess(1), w0 = motion[0] * b, w1 = motion[1] * b;
         V3 e0 = excess(x0, w0), e1 = excess(x1, w1), edge = x1 - x0;
-        V3 e_before = nothing, c_before = nothing, c_here = nothing, n_before = nothing;
-        V3 couple_before = nothing;
-        V rho_before = none, gap_before = none;
-        V3 pd1 = nothing, po1 = nothing, q1 = nothing, v1 = nothing, pd2 = nothing, po2 = nothing;
-        V3 v2 = nothing, l0 = nothing, l1 = nothing, l2 = nothing, t1 = nothing;
-        V s1 = none, vt1 = none, least = one;
+        V3 e_before = nothing, c_before = nothing, c_here = nothing, couple_before = nothing;
+        V gap_before = none;
+FACTOR_BEGIN        V3 v1 = nothing, v2 = nothing;
+        V vt1 = none, least = one;
         for (int k = 0; k <= segments; ++k) {
             V3 n = nothing, couple = nothing, c_after = nothing, e_after = nothing;
             V3 edge_after = nothing, x2 = nothing, w2 = nothing, e2 = nothing;
@@ -125,54 +115,9 @@ STEP = """
                     c_after = edge_after - edge;
                 }
             }
-            const V drag = V(k == 0 || k == segments ? drag_end : drag_inner);
-            const T below = (k >= 2 ? T(-2) : T(0)) + (k >= 1 && k < segments ? T(-2) : T(0));
-            const T bend = (k >= 2 ? T(1) : T(0)) + (k >= 1 && k < segments ? T(4) : T(0))
-                + (k + 2 <= segments ? T(1) : T(0));
-            V3 r = e0 * drag + (e_before + e_after) * drag_off + couple_before - couple;
+FACTOR_NODE            V3 r = e0 * drag + (e_before + e_after) * drag_off + couple_before - couple;
             r = r - (c_before - c_here * V(T(2)) + c_after) * kappa;
             if (LOADED) r = r + load[k] * h_force;
-
-            const V off = drag_off + kappa * below - rho_before;
-            const V3 u = n_before * rho_before;
-            const V3 w_0 = V3{off + u.x * n_before.x - kappa * l0.x,
-                u.x * n_before.y - kappa * l1.x, u.x * n_before.z - kappa * l2.x};
-            const V3 w_1 = V3{u.y * n_before.x - kappa * l0.y,
-                off + u.y * n_before.y - kappa * l1.y, u.y * n_before.z - kappa * l2.y};
-            const V3 w_2 = V3{u.z * n_before.x - kappa * l0.z,
-                u.z * n_before.y - kappa * l1.z, off + u.z * n_before.z - kappa * l2.z};
-            const V3 wt = t1 * kappa, t = sym(pd1, po1, n_before);
-            l0 = sym(pd1, po1, w_0) + q1 * wt.x;
-            l1 = sym(pd1, po1, w_1) + q1 * wt.y;
-            l2 = sym(pd1, po1, w_2) + q1 * wt.z;
-            const V3 lt = V3{w_0.dot(q1), w_1.dot(q1), w_2.dot(q1)} + wt * s1;
-
-            const V alpha = drag + kappa * bend + rho_before + rho;
-            const V3 d = V3{
-                alpha - u.x * n_before.x - rho * n.x * n.x - l0.dot(w_0) - lt.x * wt.x,
-                alpha - u.y * n_before.y - rho * n.y * n.y - l1.dot(w_1) - lt.y * wt.y,
-                alpha - u.z * n_before.z - rho * n.z * n.z - l2.dot(w_2) - lt.z * wt.z}
-                - pd2 * kappa2;
-            const V3 o = V3{
-                none - u.x * n_before.y - rho * n.x * n.y - l0.dot(w_1) - lt.x * wt.y,
-                none - u.x * n_before.z - rho * n.x * n.z - l0.dot(w_2) - lt.x * wt.z,
-                none - u.y * n_before.z - rho * n.y * n.z - l1.dot(w_2) - lt.y * wt.z}
-                - po2 * kappa2;
-            const V3 along = n_before + V3{l0.dot(n_before), l1.dot(n_before), l2.dot(n_before)};
-            const V slack = k > 0 ? compliance + n_before.dot(t) : one;
-
-            // inverse of [[A, along], [along^T, -slack]], as `block_inverse`
-            const V xx = d.y * d.z - o.z * o.z, yy = d.x * d.z - o.y * o.y;
-            const V zz = d.x * d.y - o.x * o.x, xy = o.y * o.z - o.x * d.z;
-            const V xz = o.x * o.z - o.y * d.y, yz = o.x * o.y - d.x * o.z;
-            const V det = d.x * xx + o.x * xy + o.y * xz;
-            const V3 adj = sym(V3{xx, yy, zz}, V3{xy, xz, yz}, along);
-            const V whole = slack * det + along.dot(adj);
-            const V inverse_det = one / det, inverse_whole = one / whole;
-            const V3 q = adj * inverse_whole;
-            const V3 pd = V3{xx - adj.x * q.x, yy - adj.y * q.y, zz - adj.z * q.z} * inverse_det;
-            const V3 po = V3{xy - adj.x * q.y, xz - adj.x * q.z, yz - adj.y * q.z} * inverse_det;
-            const V s = none - det * inverse_whole;
             V sign = d.x < zz ? d.x : zz;
             const V other = det < whole ? det : whole;
             sign = sign < other ? sign : other;
@@ -183,18 +128,11 @@ STEP = """
             const V yt = gap_before + n_before.dot(v1);
             const V3 v = sym(pd, po, y) + q * yt;
             const V vt = q.dot(y) + yt * s;
-            stored[k] = Node{pd, po, q, l0, l1, l2, lt, v, n, s, vt};
+            stored[k] = Node{pd, po, q, l0, l1, l2, lt, v, n, s, vt, rho};
 
-            pd2 = pd1;
-            po2 = po1;
-            v2 = v1;
-            pd1 = pd;
-            po1 = po;
-            q1 = q;
-            s1 = s;
+FACTOR_NEXT            v2 = v1;
             v1 = v;
             vt1 = vt;
-            t1 = t;
             e_before = e0;
             e0 = e1;
             e1 = e2;
@@ -204,9 +142,7 @@ STEP = """
             edge = edge_after;
             c_before = c_here;
             c_here = c_after;
-            n_before = n;
             couple_before = couple;
-            rho_before = rho;
             gap_before = gap;
         }
         const M failed = !(least > none) && !clipped;
@@ -268,6 +204,22 @@ STEP = """
             }
         }
         fiber_error.data[fiber + l] = error;
+    }
+    // W numbers of all lanes at a time
+    for (int k = 0; k < nodes && axes_stride > 0; k += W / 4) {
+        V r[W];
+        for (int n = 0; n < W / 4; ++n) {
+            const Node& from = stored[k + n < nodes ? k + n : segments];
+            r[4 * n] = from.n.x;
+            r[4 * n + 1] = from.n.y;
+            r[4 * n + 2] = from.n.z;
+            r[4 * n + 3] = from.rho;
+        }
+        TURN
+        for (int l = 0; l < own; ++l)
+            *(U*)(axes.data + (long long)axes_stride * (fiber + l) + 4 * k) = r[l];
+    }
+    for (int l = 0; l < own; ++l) {
         if (row_stride <= 0) continue;
         for (int k = 0; k < nodes; ++k) {
             const Node& from_node = stored[k];
@@ -298,12 +250,17 @@ def chain_blocks(name: str, fiber_group: np.ndarray) -> np.ndarray:
 
 @cache
 def make_native_chain(name: str, loaded: bool = False) -> Any:
-    """Kernel `native_chain_step` over blocks: as `chain_step` of two stages; see its arguments."""
+    """Kernel `native_chain_step` over blocks: as `chain_step` of two stages; see its arguments.
+
+    `row_stride` 0: no rows are left; `axes_stride` > 0: axes of every node, see `native_factor`.
+    """
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Group = group_struct(name)
     Row = elimination_row(name)
     text = STEP
+    for key, value in FACTOR_TEXTS.items():
+        text = text.replace(key, value)
     for key, value in {
         "MOST_NODES": MOST_NODES,
         "LOADED": str(loaded).lower(),
@@ -311,6 +268,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
         "TORN_AT": TORN,
         "BAD_AT": BAD_FIBER,
         "CHI": repr(CHI),
+        "TURN": transpose(LANES[name]),
     }.items():
         text = text.replace(key, str(value))
 
@@ -321,6 +279,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
         keeps: wp.int32,
         clips: wp.int32,
         row_stride: wp.int32,
+        axes_stride: wp.int32,
         flow_origin: vec3,
         step_size: wp.array(dtype=wp.float64),
         fiber_pace: wp.array(dtype=real),
@@ -329,6 +288,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=Row),
+        axes: wp.array(dtype=real),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         tension: wp.array(dtype=real),
@@ -347,6 +307,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
         keeps: wp.int32,
         clips: wp.int32,
         row_stride: wp.int32,
+        axes_stride: wp.int32,
         flow_origin: vec3,
         step_size: wp.array(dtype=wp.float64),
         fiber_pace: wp.array(dtype=real),
@@ -355,6 +316,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=Row),
+        axes: wp.array(dtype=real),
         node_pos: wp.array(dtype=vec3),
         node_velocity: wp.array(dtype=vec3),
         tension: wp.array(dtype=real),
@@ -374,6 +336,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
             keeps,
             clips,
             row_stride,
+            axes_stride,
             flow_origin,
             step_size,
             fiber_pace,
@@ -382,6 +345,7 @@ def make_native_chain(name: str, loaded: bool = False) -> Any:
             fiber_node_start,
             fiber_group,
             rows,
+            axes,
             node_pos,
             node_velocity,
             tension,

@@ -1,14 +1,16 @@
 """Which rows of contact pairs have, many pairs at a time: C++ text for `pair_motion`.
 
 Repeats `row_geometry.make_row_geometry` for what depends on two segments and their motion alone.
-What may depend on the segments beside them (a place near a joint), on radii that differ, or on
-bead pairs is marked LOOK and decided by `row_count`.
+Pairs for which the segments beside them count (a place near a joint) wait for each other and are
+decided by `native_row_joints`; what may depend on radii that differ, or on bead pairs, is marked
+LOOK and decided by `row_count`.
 
 Source: as there: closest points and four ends, those whose predicted gap is below `keep` and that
     no row nearby stands for.
 Symbols: as there; `settles`: radii are equal and nothing but predicted gaps decides.
 """
 
+from warpfiber.passes.native_row_joints import JOINTS
 from warpfiber.passes.pairs import END_TOLERANCE
 from warpfiber.passes.row_geometry import CLOSER, CROSSING
 
@@ -17,7 +19,12 @@ FIRST, LAST = 1, 2  # a segment begins, ends its fiber
 SLACK = 1e-4  # radii: where rounding may decide, the other kernel does
 
 TEXT = """
-    auto find_slots = [&](const int* pairs, int count) __attribute__((noinline)) {
+    int at_joints[2 * W], joints = 0;
+    struct Alone { enum { value = 0 }; };
+    struct ByJoints { enum { value = 1 }; };
+    // compiled for each of both
+    auto find_slots = [&](const int* pairs, int count, auto kind) __attribute__((noinline)) {
+        constexpr bool beside = decltype(kind)::value;
         const Motion m = motion_of(pairs);
         const V aa = larger(m.a.dot(m.a), least), bb = larger(m.b.dot(m.b), least);
         const V ab = m.a.dot(m.b), da = m.d.dot(m.a), db = m.d.dot(m.b);
@@ -32,7 +39,7 @@ TEXT = """
         const T now_below = settles ? T(-1e20) : widest * (near_now + T(SLACK));
         const T damp = wet * (T(1) + T(SLACK));
         V apart2[5];
-        M close[5], look = V(T(0)) > V(T(1));
+        M close[5], look = V(T(0)) > V(T(1)), waits = look;
         for (int k = 0; k < 5; ++k) {
             const V s = places[k].s, t = places[k].t;
             const V3 c = m.d + m.b * t - m.a * s, moved = m.w + m.wb * t - m.wa * s;
@@ -78,6 +85,12 @@ TEXT = """
                 return (~begins & (s * length < arc))
                     | (~ends & (((T(1) - s) * length < arc) | (s >= T(1) - near)));
             };
+JOINTS
+            Beside by_i, by_j;
+            if (beside) {
+                by_i = beside_of(pair_i);
+                by_j = beside_of(pair_j);
+            }
             const M has_first = ~(is_joint(places[0].s, first_i, last_i)
                                   | is_joint(places[0].t, first_j, last_j));
             bits = has_first & close[0] ? V(T(1)) : bits;
@@ -85,8 +98,17 @@ TEXT = """
             for (int k = 1; k < 3; ++k) {
                 M made = with_i[k - 1] & ~(has_first & same(places[k], places[0]));
                 made &= ~((places[k].t <= near) & ~first_j);
-                look |= made & by_joint(places[k].t, length_b, first_j, last_j);
-                if (k == 1) look |= made & ~last_i;
+                if (beside) {
+                    const V t = places[k].t;
+                    const V3 c = m.d + m.b * t - m.a * places[k].s;
+                    made &= is_nearest(t, c, m.b, length_b, by_j, first_j, last_j);
+                    if (k == 1)
+                        made &= last_i | ~is_beside_next(
+                            m.d - m.a, by_i, m.b, bb, length_b, t, first_j, last_j);
+                } else {
+                    waits |= made & by_joint(places[k].t, length_b, first_j, last_j);
+                    if (k == 1) waits |= made & ~last_i;
+                }
                 bits += made ? V(T(1 << k)) : V(T(0));
             }
             const M with_j[2] = {close[3], close[4] & first_j};
@@ -98,13 +120,26 @@ TEXT = """
                     made &= ~(same(places[k], places[other]) & stands);
                 }
                 made &= ~((places[k].s <= near) & ~first_i);
-                look |= made & by_joint(places[k].s, length_a, first_i, last_i);
-                if (k == 3) look |= made & ~last_j;
+                if (beside) {
+                    const V at = places[k].s;
+                    const V3 c = m.a * at - m.d - m.b * places[k].t;
+                    made &= is_nearest(at, c, m.a, length_a, by_i, first_i, last_i);
+                    if (k == 3)
+                        made &= last_j | ~is_beside_next(
+                            V3{} - m.d - m.b, by_j, m.a, aa, length_a, at, first_i, last_i);
+                } else {
+                    waits |= made & by_joint(places[k].s, length_a, first_i, last_i);
+                    if (k == 3) waits |= made & ~last_j;
+                }
                 bits += made ? V(T(1 << k)) : V(T(0));
             }
+            bits = waits ? V(T(0)) : bits;
         } else {
             for (int k = 0; k < 5; ++k) look |= close[k] | (apart2[k] < damp * damp);
         }
+        waits &= ~look;
+        for (int l = 0; l < count; ++l)
+            if (waits[l]) at_joints[joints++] = pairs[l];
         bits = look ? V(T(LOOK)) : bits;
         for (int l = 0; l < count; ++l) {
             const int found = (int)bits[l];
@@ -120,12 +155,22 @@ TEXT = """
             segment_rows.data[i] += made;
         }
     };
+    // a vector of those that wait, at the end what is left
+    auto find_joints = [&](bool all) {
+        while (joints >= W || (all && joints > 0)) {
+            const int count = joints < W ? joints : W;
+            for (int l = count; l < W; ++l) at_joints[l] = at_joints[count - 1];
+            joints -= count;
+            find_slots(at_joints, count, ByJoints{});
+            for (int l = 0; l < joints; ++l) at_joints[l] = at_joints[W + l];
+        }
+    };
 """
 
 
 def slots_text(name: str) -> str:
-    """`find_slots(pairs, count)`, in which `NONE` is the code of a pair that is no image."""
-    text = TEXT
+    """`find_slots(pairs, count, kind)`, `find_joints(all)`; `NONE`: a pair that is no image."""
+    text = TEXT.replace("JOINTS", JOINTS)
     for key, value in {
         "SLACK": repr(SLACK),
         "LOOK": str(LOOK),

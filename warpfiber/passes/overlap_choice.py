@@ -47,12 +47,24 @@ def make_overlap_choice(name: str, module: str = "unique"):
     @wp.kernel(**options)
     def clear_marks(
         offset: wp.int32,
+        fiber_node_start: wp.array(dtype=wp.int32),
+        out_start: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         fiber_marked_out: wp.array(dtype=wp.uint8),
+        segment_rows_out: wp.array(dtype=wp.int32),
+        pair_row_count_out: wp.array(dtype=wp.int32),
     ):
+        """One thread per fiber: no marks, no rows. Pairs of a fiber lie behind each other."""
         if status[wp.static(HALT)] != 0:
             return
-        fiber_marked_out[wp.tid() + offset] = wp.uint8(0)
+        fiber = wp.tid() + offset
+        fiber_marked_out[fiber] = wp.uint8(0)
+        first = fiber_node_start[fiber] - fiber
+        last = fiber_node_start[fiber + 1] - fiber - 1
+        for i in range(first, last):
+            segment_rows_out[i] = 0
+        for k in range(out_start[first], out_start[last]):
+            pair_row_count_out[k] = 0
 
     @wp.kernel(**options)
     def mark_fibers(
@@ -126,9 +138,11 @@ class OverlapChoice:
         marks = [check.overlap, check.overlap_partner, model.segment_fiber]
         pairs = [model.segment_fiber, rows.pairs.out_start, rows.pairs.pair_j]
         chosen = [self.segment_chosen, rows.pair_slots]
+        cleared = [model.fiber_node_start, rows.pairs.out_start, state.status]
+        cleared += [self.fiber_marked, rows.segment_rows, rows.pair_row_count]
         fibers, segments = model.fiber_count, model.segment_count
         return [
-            self._launch("clear_marks", fibers, [state.status, self.fiber_marked]),
+            self._launch("clear_marks", fibers, cleared),
             self._launch(
                 "mark_fibers", segments, [*found, *marks, state.status, self.fiber_marked]
             ),

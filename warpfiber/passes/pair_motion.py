@@ -83,7 +83,8 @@ SLOTS
             held += clear[l] > looked_at ? 0 : 1;
         }
         if (held >= W) {
-            find_slots(waiting, W);
+            find_slots(waiting, W, Alone{});
+            find_joints(false);
             held -= W;
             for (int l = 0; l < held; ++l) waiting[l] = waiting[W + l];
         }
@@ -91,8 +92,9 @@ SLOTS
     }
     if (held > 0) {
         for (int l = held; l < W; ++l) waiting[l] = waiting[held - 1];
-        find_slots(waiting, held);
+        find_slots(waiting, held, Alone{});
     }
+    find_joints(true);
 """
 
 

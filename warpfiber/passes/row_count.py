@@ -125,10 +125,7 @@ def make_row_count(name: str, features: RowFeatures, module: str = "unique"):
             return
         i = portioned(wp.tid() + offset, segment_node.shape[0], wp.static(PORTION))
         if wp.static(features.chosen):
-            if segment_chosen[i] == wp.uint8(0):
-                segment_rows_out[i] = 0
-                for k in range(out_start[i], out_start[i + 1]):
-                    pair_row_count_out[k] = 0
+            if segment_chosen[i] == wp.uint8(0):  # cleared by `overlap_choice`
                 return
         if wp.static(not features.chosen and not has_walls):
             if segment_look[i] == wp.uint8(0):
