@@ -24,6 +24,7 @@ from warpfiber.model import (
     Units,
     precision,
 )
+from warpfiber.passes.kernel_module import FUSED, foresee_modules
 from warpfiber.passes.precision import group_struct
 from warpfiber.placement import Placement, place_fibers, split_tables
 from warpfiber.placement.bend import BENT, largest_bend
@@ -174,6 +175,12 @@ def _closing_segments(scene: Scene) -> np.ndarray:
     meets = scene.contact.law != "none"
     closed = [meets and g.shape.kind == "ring" and g.node_file is None for g in scene.fibers]
     return np.asarray(closed, dtype=np.int32)
+
+
+def foresee_kernels(scene: Scene, device: str) -> None:
+    """Begin to compile for a scene whose fibers are still to be placed, where all is to be done."""
+    if device.startswith("cpu"):
+        foresee_modules(*([FUSED] if scene.numerics.method == "bonded_spheres" else []))
 
 
 def build(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfiber.build import build, realized_scene
+from warpfiber.build import build, foresee_kernels, realized_scene
 from warpfiber.methods.bead_chain import BeadChain
 from warpfiber.methods.bonded_spheres import BondedSpheres
 from warpfiber.methods.method import Method
@@ -134,6 +134,7 @@ class Simulation:
         saved = None
         if placement is None:
             preflight(scene)
+            foresee_kernels(scene, choose_device(scene, CUDA_BREAK_EVEN))
             if scene.start is None:
                 placement = place_fibers(scene)
             else:
@@ -323,8 +324,7 @@ class Simulation:
         return np.asarray(self.state.lattice.numpy()[0]) * self.model.units.length
 
     def _unwrapped(self) -> np.ndarray:
-        nodes = np.asarray(self.state.node_pos.numpy(), dtype=float)
-        unwrapped: np.ndarray = nodes + self._image_shift()
+        unwrapped: np.ndarray = self.state.node_pos.numpy().astype(float) + self._image_shift()
         return unwrapped
 
     def _image_shift(self) -> np.ndarray:

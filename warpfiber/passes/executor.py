@@ -21,6 +21,7 @@ from typing import Any
 
 import warp as wp
 
+from warpfiber.passes.kernel_module import load_modules
 from warpfiber.passes.work_stealing import StolenLaunch, stealing_kernel
 from warpfiber.passes.worker_choice import WorkerChoice
 from warpfiber.passes.workers import Barrier, Workers, crew_kernels, meet_kernel
@@ -35,9 +36,10 @@ def load_kernels(kernels: Iterable[Any], device: str) -> None:
     """Compile or load kernels, several at a time, for the block size of `wp.launch`."""
     modules = list(dict.fromkeys(kernel.module for kernel in kernels))
     target = wp.get_device(device)
-    if modules:
-        block = 1 if target.is_cpu else 256
-        wp.force_load(target, modules=modules, block_dim=block, max_workers=COMPILERS)
+    if modules and target.is_cpu:
+        load_modules(modules, target, COMPILERS)
+    elif modules:
+        wp.force_load(target, modules=modules, block_dim=256, max_workers=COMPILERS)
 
 
 @dataclass

@@ -67,75 +67,77 @@ def make_list_bound(name: str, module: str = "unique", native: bool = False):
         carried = before[0] - wp.identity(n=3, dtype=wp.float64)
         return wp.ddot(carried, carried) == wp.float64(0.0)
 
-    @wp.kernel(**options)
-    def bound_fibers(
-        offset: wp.int32,
-        flow_origin: vec3,
-        segments: wp.int32,
-        spares: wp.int32,
-        segment_node: wp.array(dtype=wp.int32),
-        list_sizes: wp.array(dtype=real),
-        segment_extension: wp.array(dtype=real),
-        fiber_node_start: wp.array(dtype=wp.int32),
-        deformation_back: wp.array(dtype=wp.mat33d),
-        deformation: wp.array(dtype=wp.mat33d),
-        list_pos: wp.array(dtype=vec3),
-        node_back: wp.array(dtype=vec3),
-        node_pos: wp.array(dtype=vec3),
-        segment_shift: wp.array(dtype=real),
-        shift_again: wp.array(dtype=real),
-        status: wp.array(dtype=wp.int32),
-        pairs_known_out: wp.array(dtype=wp.int32),
-        step_strain_out: wp.array(dtype=real),
-        segment_moved_out: wp.array(dtype=real),
-        short_out: wp.array(dtype=wp.int64),
-        use_out: wp.array(dtype=vec3),
-        share_out: wp.array(dtype=real),
-    ):
-        if status[wp.static(HALT)] != 0:
-            return
-        fiber = wp.tid() + offset
-        affine = mat33(deformation[0])
-        limit = farthest_motion(affine, list_sizes)
-        push = step_push(deformation_back, deformation)
-        if fiber == 0:
-            step_strain_out[0] = largest_strain(push)
-            if is_new(deformation_back):
-                pairs_known_out[0] = 0
-        found = wp.int64(0)
-        slid = zero
-        across = zero
-        most = zero
-        for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
-            listed = list_pos[i + 1] - list_pos[i]
-            length = wp.length(listed)
-            longer = list_sizes[2]
-            if segment_extension.shape[0] > 0:
-                longer = segment_extension[i - fiber]
-            beyond = longer / length
-            start = flow_origin + affine * (list_pos[i] - flow_origin)
-            axis = affine * listed
-            inverse = one / wp.dot(axis, axis)
-            moved2 = zero
-            for end in range(2):
-                apart = node_pos[i + end] - start
-                s = wp.dot(apart, axis) * inverse
-                nearest = wp.clamp(s, -beyond, one + beyond)
-                off = wp.length_sq(apart - nearest * axis)
-                if not (off <= limit * limit):
-                    found = wp.int64(1)
-                most = wp.max(most, off)
-                slid = wp.max(slid, wp.max(-s, s - one) * length)
-                across = wp.max(across, wp.length_sq(apart - s * axis))
-                carried = push * (node_back[i + end] - flow_origin)
-                moved2 = wp.max(moved2, wp.length_sq(node_pos[i + end] - flow_origin - carried))
-            s_at = i - fiber
-            segment_moved_out[s_at] = wp.sqrt(moved2) + segment_shift[s_at] + shift_again[s_at]
-        if limit < zero:
-            found = wp.int64(1)
-        short_out[fiber] = found
-        use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
-        share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
+    if not native:
+
+        @wp.kernel(**options)
+        def bound_fibers(
+            offset: wp.int32,
+            flow_origin: vec3,
+            segments: wp.int32,
+            spares: wp.int32,
+            segment_node: wp.array(dtype=wp.int32),
+            list_sizes: wp.array(dtype=real),
+            segment_extension: wp.array(dtype=real),
+            fiber_node_start: wp.array(dtype=wp.int32),
+            deformation_back: wp.array(dtype=wp.mat33d),
+            deformation: wp.array(dtype=wp.mat33d),
+            list_pos: wp.array(dtype=vec3),
+            node_back: wp.array(dtype=vec3),
+            node_pos: wp.array(dtype=vec3),
+            segment_shift: wp.array(dtype=real),
+            shift_again: wp.array(dtype=real),
+            status: wp.array(dtype=wp.int32),
+            pairs_known_out: wp.array(dtype=wp.int32),
+            step_strain_out: wp.array(dtype=real),
+            segment_moved_out: wp.array(dtype=real),
+            short_out: wp.array(dtype=wp.int64),
+            use_out: wp.array(dtype=vec3),
+            share_out: wp.array(dtype=real),
+        ):
+            if status[wp.static(HALT)] != 0:
+                return
+            fiber = wp.tid() + offset
+            affine = mat33(deformation[0])
+            limit = farthest_motion(affine, list_sizes)
+            push = step_push(deformation_back, deformation)
+            if fiber == 0:
+                step_strain_out[0] = largest_strain(push)
+                if is_new(deformation_back):
+                    pairs_known_out[0] = 0
+            found = wp.int64(0)
+            slid = zero
+            across = zero
+            most = zero
+            for i in range(fiber_node_start[fiber], fiber_node_start[fiber + 1] - 1):
+                listed = list_pos[i + 1] - list_pos[i]
+                length = wp.length(listed)
+                longer = list_sizes[2]
+                if segment_extension.shape[0] > 0:
+                    longer = segment_extension[i - fiber]
+                beyond = longer / length
+                start = flow_origin + affine * (list_pos[i] - flow_origin)
+                axis = affine * listed
+                inverse = one / wp.dot(axis, axis)
+                moved2 = zero
+                for end in range(2):
+                    apart = node_pos[i + end] - start
+                    s = wp.dot(apart, axis) * inverse
+                    nearest = wp.clamp(s, -beyond, one + beyond)
+                    off = wp.length_sq(apart - nearest * axis)
+                    if not (off <= limit * limit):
+                        found = wp.int64(1)
+                    most = wp.max(most, off)
+                    slid = wp.max(slid, wp.max(-s, s - one) * length)
+                    across = wp.max(across, wp.length_sq(apart - s * axis))
+                    carried = push * (node_back[i + end] - flow_origin)
+                    moved2 = wp.max(moved2, wp.length_sq(node_pos[i + end] - flow_origin - carried))
+                s_at = i - fiber
+                segment_moved_out[s_at] = wp.sqrt(moved2) + segment_shift[s_at] + shift_again[s_at]
+            if limit < zero:
+                found = wp.int64(1)
+            short_out[fiber] = found
+            use_out[fiber] = vec3(slid, wp.sqrt(across), limit)
+            share_out[fiber] = wp.sqrt(most) / wp.max(limit, real(1e-30))
 
     @wp.kernel(**options)
     def bound_list(

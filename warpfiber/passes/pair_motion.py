@@ -118,78 +118,79 @@ def make_pair_motion(name: str, periodic: bool, module: str = "unique", native: 
     _, image_shift, _, _ = make_pair_geometry(name, PairFeatures(periodic=periodic))
     options: dict[str, Any] = {"module": module, "enable_backward": False, "grid_stride": False}
 
-    @wp.kernel(**options)
-    def pair_motion(
-        offset: wp.int32,
-        segments: wp.int32,
-        segment_node: wp.array(dtype=wp.int32),
-        out_start: wp.array(dtype=wp.int32),
-        pair_i: wp.array(dtype=wp.int32),
-        pair_j: wp.array(dtype=wp.int32),
-        pair_image: wp.array(dtype=wp.int32),
-        lattice_back: wp.array(dtype=mat33),
-        lattice_now: wp.array(dtype=mat33),
-        node_back: wp.array(dtype=vec3),
-        node_pos: wp.array(dtype=vec3),
-        status: wp.array(dtype=wp.int32),
-        widest: real,
-        keep: real,
-        near_now: real,
-        looked_at: real,
-        wet: real,
-        settles: wp.int32,
-        segment_fiber: wp.array(dtype=wp.int32),
-        segment_ends: wp.array(dtype=wp.uint8),
-        pairs_known: wp.array(dtype=wp.int32),
-        step_strain: wp.array(dtype=real),
-        segment_moved: wp.array(dtype=real),
-        pair_clear: wp.array(dtype=real),
-        pair_slots: wp.array(dtype=wp.uint8),
-        pair_row_count: wp.array(dtype=wp.int32),
-        segment_rows: wp.array(dtype=wp.int32),
-        segment_look: wp.array(dtype=wp.uint8),
-    ):
-        if status[wp.static(HALT)] != 0:
-            return
-        i = wp.tid() + offset
-        node_i = segment_node[i]
-        xi = node_back[node_i]
-        a = node_back[node_i + 1] - xi
-        move_i = node_pos[node_i] - xi
-        wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
-        stays = real(1.0) - step_strain[0]
-        segment_rows[i] = 0
-        looked_for = wp.uint8(0)
-        for k in range(out_start[i], out_start[i + 1]):
-            if pairs_known[0] != 0:
-                least = stays * pair_clear[k] - segment_moved[i] - segment_moved[pair_j[k]]
-                if least > looked_at:
-                    pair_clear[k] = least
-                    pair_slots[k] = wp.uint8(0)
-                    pair_row_count[k] = 0
-                    continue
-            node_j = segment_node[pair_j[k]]
-            xj = node_back[node_j]
-            b = node_back[node_j + 1] - xj
-            shift = image_shift(pair_image[k], lattice_back[0])
-            delta = xj - xi + shift
-            move_j = node_pos[node_j] - xj
-            w = move_j - move_i
-            if wp.static(periodic):
-                w += image_shift(pair_image[k], lattice_now[0]) - shift
-            wb = node_pos[node_j + 1] - node_back[node_j + 1] - move_j
-            st = closest_points(delta, a, b)
-            distance = wp.length(delta + st[1] * b - st[0] * a)
-            off_flow = segment_moved[i] + segment_moved[pair_j[k]]
-            clear = wp.max(distance - largest_motion(w, wa, wb), stays * distance - off_flow)
-            pair_clear[k] = clear
-            near = wp.uint8(wp.where(clear > looked_at, 0, 1))
-            pair_slots[k] = wp.uint8(wp.static(LOOK)) * near
-            pair_row_count[k] = 0
-            looked_for = looked_for | near
-        segment_look[i] = looked_for
-
     if not native:
+
+        @wp.kernel(**options)
+        def pair_motion(
+            offset: wp.int32,
+            segments: wp.int32,
+            segment_node: wp.array(dtype=wp.int32),
+            out_start: wp.array(dtype=wp.int32),
+            pair_i: wp.array(dtype=wp.int32),
+            pair_j: wp.array(dtype=wp.int32),
+            pair_image: wp.array(dtype=wp.int32),
+            lattice_back: wp.array(dtype=mat33),
+            lattice_now: wp.array(dtype=mat33),
+            node_back: wp.array(dtype=vec3),
+            node_pos: wp.array(dtype=vec3),
+            status: wp.array(dtype=wp.int32),
+            widest: real,
+            keep: real,
+            near_now: real,
+            looked_at: real,
+            wet: real,
+            settles: wp.int32,
+            segment_fiber: wp.array(dtype=wp.int32),
+            segment_ends: wp.array(dtype=wp.uint8),
+            pairs_known: wp.array(dtype=wp.int32),
+            step_strain: wp.array(dtype=real),
+            segment_moved: wp.array(dtype=real),
+            pair_clear: wp.array(dtype=real),
+            pair_slots: wp.array(dtype=wp.uint8),
+            pair_row_count: wp.array(dtype=wp.int32),
+            segment_rows: wp.array(dtype=wp.int32),
+            segment_look: wp.array(dtype=wp.uint8),
+        ):
+            if status[wp.static(HALT)] != 0:
+                return
+            i = wp.tid() + offset
+            node_i = segment_node[i]
+            xi = node_back[node_i]
+            a = node_back[node_i + 1] - xi
+            move_i = node_pos[node_i] - xi
+            wa = node_pos[node_i + 1] - node_back[node_i + 1] - move_i
+            stays = real(1.0) - step_strain[0]
+            segment_rows[i] = 0
+            looked_for = wp.uint8(0)
+            for k in range(out_start[i], out_start[i + 1]):
+                if pairs_known[0] != 0:
+                    least = stays * pair_clear[k] - segment_moved[i] - segment_moved[pair_j[k]]
+                    if least > looked_at:
+                        pair_clear[k] = least
+                        pair_slots[k] = wp.uint8(0)
+                        pair_row_count[k] = 0
+                        continue
+                node_j = segment_node[pair_j[k]]
+                xj = node_back[node_j]
+                b = node_back[node_j + 1] - xj
+                shift = image_shift(pair_image[k], lattice_back[0])
+                delta = xj - xi + shift
+                move_j = node_pos[node_j] - xj
+                w = move_j - move_i
+                if wp.static(periodic):
+                    w += image_shift(pair_image[k], lattice_now[0]) - shift
+                wb = node_pos[node_j + 1] - node_back[node_j + 1] - move_j
+                st = closest_points(delta, a, b)
+                distance = wp.length(delta + st[1] * b - st[0] * a)
+                off_flow = segment_moved[i] + segment_moved[pair_j[k]]
+                clear = wp.max(distance - largest_motion(w, wa, wb), stays * distance - off_flow)
+                pair_clear[k] = clear
+                near = wp.uint8(wp.where(clear > looked_at, 0, 1))
+                pair_slots[k] = wp.uint8(wp.static(LOOK)) * near
+                pair_row_count[k] = 0
+                looked_for = looked_for | near
+            segment_look[i] = looked_for
+
         return pair_motion
 
     text = BLOCK.replace("SLOTS", slots_text(name))
