@@ -48,6 +48,7 @@ from warpfiber.passes.measure_layers import make_measure_layers
 from warpfiber.passes.measure_stress import make_measure_stress
 from warpfiber.passes.nodes import NodeFeatures, make_node_sweep
 from warpfiber.passes.overlap_choice import make_overlap_choice
+from warpfiber.passes.pair_groups import make_pair_groups
 from warpfiber.passes.pair_motion import make_pair_motion
 from warpfiber.passes.pairs import PairFeatures, make_pair_sweep
 from warpfiber.passes.prune_kernels import make_plain_prune, make_wide_kernels
@@ -103,6 +104,7 @@ FULLEST: tuple[Variant, ...] = (
     (make_bond_drift, ()),
     (make_bond_losses, (_RINGS,)),
     (make_bond_losses, (_GRIPPED,)),
+    (make_pair_groups, ()),
     (make_capsule_hits, (_RUBBING,)),
     (make_capsule_pairs, (_RUBBING,)),
     (make_contact_energy, (_RUBBING,)),

@@ -99,10 +99,10 @@ def make_capsule_patch(name):
         leading: real,
         forward: wp.bool,
     ):
-        """Of slices across e, with E* f sine = 1; forward: sigma = 1.
+        """Of slices across e; weight = E* f sine times the part of this way; forward: sigma = 1.
 
         by_la = 1 / la; by_lb = sigma / lb; wider = 1 / (1 + cosine); by_ww = 1 / w^2; leading =
-        d ln weight / d cosine.
+        d ln of that part / d cosine.
         """
         nothing = vec3(zero, zero, zero)
         e = along_a + along_b

@@ -89,6 +89,7 @@ def pair_launches(spheres: BondedSpheres, dt: float) -> list[Launch]:
         p.real(spheres.scene.contact.damping),
         p.real(spheres.scene.contact.friction),
         spheres.groups,
+        spheres.pair_groups,
         model.fiber_node_start,
         model.fiber_group,
         model.segment_node,

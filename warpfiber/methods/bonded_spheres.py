@@ -40,6 +40,7 @@ from warpfiber.passes.native_bonds_source import FROM_NODES, LOADS
 from warpfiber.passes.near_pairs import PAIR_COST
 from warpfiber.passes.node_walls import SIDES
 from warpfiber.passes.nodes import TEAR_STRETCH
+from warpfiber.passes.pair_groups import make_pair_group_table
 from warpfiber.scene import Fault, FiberGroup, Scene, SceneError, Stage
 from warpfiber.scene.containers import container
 from warpfiber.scene.gripping import GRIPPING
@@ -86,6 +87,7 @@ class BondedSpheres(Method):
             dtype=bond_group_struct(p.name),
             device=device,
         )
+        self.pair_groups = make_pair_group_table(p.name, self.groups, device)
         axis, length = self._stress_free()
         self.bond_axis = wp.array(axis.astype(p.numpy), dtype=p.vec3, device=device)
         self.bond_length = wp.array(length.astype(p.numpy), dtype=p.real, device=device)

@@ -106,6 +106,7 @@ class Energies:
         pairs = contacts.search.list
         return [
             spheres.groups,
+            spheres.pair_groups,
             model.fiber_node_start,
             model.fiber_group,
             model.segment_node,

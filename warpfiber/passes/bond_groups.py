@@ -37,6 +37,25 @@ def bond_group_struct(name: str) -> Any:
 
 
 @cache
+def pair_group_struct(name: str) -> Any:
+    """Warp struct of what two groups whose fibers meet share, in run units; i is the first one."""
+    real = precision(name).real
+
+    @wp.struct
+    class PairGroup:
+        reach: real  # sum of the radii
+        crossed: real  # x of `capsule_contact` where fibers cross at a right angle
+        stiffness: real  # E* sqrt(S / 2) of cylinders
+        round_i: real  # E* f of the end of i on j, of j on i, of two ends
+        round_j: real
+        round_both: real
+        shear_part: real  # tangential stiffness over the normal one
+        root_shear: real
+
+    return PairGroup
+
+
+@cache
 def node_struct(name: str) -> Any:
     """Warp struct of one node on its way through a step."""
     vec3, vec4 = precision(name).vec3, precision(name).vec4

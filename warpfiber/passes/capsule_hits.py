@@ -16,6 +16,8 @@ from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.kernel_module import FUSED
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
 
+# Packing coordinates into short vectors costs more shuffles than it saves: a tenth of the time.
+SCALAR = {"cpu_compiler_flags": FUSED["cpu_compiler_flags"] + " -fno-slp-vectorize"}
 PART = 64  # pairs of a part on the CPU, where the list is full
 
 
@@ -43,7 +45,7 @@ def make_capsule_hits(name: str, features: CapsuleFeatures):
     _, set_flag = make_items(wp.uint8)
     _, set_closest = make_items(vec2)
 
-    @wp.kernel(module="unique", module_options=FUSED, enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", module_options=SCALAR, enable_backward=False, grid_stride=False)
     def capsule_hits(
         offset: wp.int32,
         parts: wp.int32,

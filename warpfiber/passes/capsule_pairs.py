@@ -16,7 +16,7 @@ from warpfiber.laws.friction import make_friction
 from warpfiber.laws.hertz import DASHPOT
 from warpfiber.model import HALT, PAIR_COUNT, precision
 from warpfiber.passes.array_items import make_fetch, make_items
-from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.bond_groups import bond_group_struct, pair_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_hits import part_begin
 from warpfiber.passes.capsule_touch import make_capsule_touch
@@ -32,7 +32,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
     """Kernel `capsule_pairs`: what every listed pair does now; memories move on by dt."""
     p = precision(name)
     real, vec2, vec3, vec4, mat33 = p.real, p.vec2, p.vec3, p.vec4, p.mat33
-    BondGroup = bond_group_struct(name)
+    BondGroup, PairGroup = bond_group_struct(name), pair_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     _, image_shift, _, _ = make_pair_geometry(name, geometry)
     normal_contact = make_capsule_touch(name, features.closed)
@@ -94,6 +94,7 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
         beta: real,
         friction: real,
         groups: wp.array(dtype=BondGroup),
+        pair_groups: wp.array2d(dtype=PairGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
@@ -142,8 +143,11 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             node_j = number(segment_node, j)
             fiber_i = number(segment_fiber, i)
             fiber_j = number(segment_fiber, j)
-            gi = groups[number(fiber_group, fiber_i)]
-            gj = groups[number(fiber_group, fiber_j)]
+            group_i = number(fiber_group, fiber_i)
+            group_j = number(fiber_group, fiber_j)
+            gi = groups[group_i]
+            gj = groups[group_j]
+            both = pair_groups[group_i, group_j]
             at_i = node_i - number(fiber_node_start, fiber_i)
             at_j = node_j - number(fiber_node_start, fiber_j)
             end_i = node_after(node_i, at_i, ring_of(gi))
@@ -154,11 +158,10 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
             b = vec3(point(place, end_j) - xj)
             delta = vec3(xj - xi) + image_shift(number(pair_image, k), lattice[0])
             c = delta + st[1] * b - st[0] * a
-            reach = gi.radius + gj.radius
-            if wp.length_sq(c) >= reach * reach:
+            if wp.length_sq(c) >= both.reach * both.reach:
                 continue
             push, felt, n, springs, on_i, on_j = normal_contact(
-                gi, gj, at_i, at_j, delta, a, b, st, c
+                both, gi, gj, at_i, at_j, delta, a, b, st, c
             )
             if felt[2] <= zero:
                 continue
@@ -175,13 +178,11 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                 slip = v_i - v_j + wp.cross(arm_i * w_i + arm_j * w_j, n)
                 approach = wp.dot(slip, n)
                 mass = one / (inverse_mass(gi, at_i, s) + inverse_mass(gj, at_j, t))
+                resistance = dashpot * beta * wp.sqrt(felt[1] * mass)
                 if wp.static(has_dashpot):
-                    resistance = dashpot * beta * wp.sqrt(felt[1] * mass)
                     size = wp.max(size + resistance * approach, zero)
                 if wp.static(has_friction):
-                    shear = gi.shear_compliance + gj.shear_compliance
-                    ratio = real(4.0) * (gi.compliance + gj.compliance) / shear
-                    stiffness = ratio * push[1]
+                    stiffness = both.shear_part * push[1]
                     slide = slip - approach * n
                     turn = half * dt * wp.dot(w_i + w_j, n)
                     now = wp.int32(step[0])
@@ -206,9 +207,9 @@ def make_capsule_pairs(name: str, features: CapsuleFeatures):
                             pair_step,
                         )
                     h = carried_memory(vec3(kept[0], kept[1], kept[2]), kept[3], depth, n, turn)
-                    resistance = dashpot * beta * wp.sqrt(ratio * felt[1] * mass)
+                    damping = both.root_shear * resistance
                     force, h = friction_force(
-                        h + dt * slide, stiffness, resistance, slide, friction * size
+                        h + dt * slide, stiffness, damping, slide, friction * size
                     )
                     pair_memory[now & 1, k] = vec4(h[0], h[1], h[2], depth)
                     pair_step[now & 1, k] = now

@@ -18,7 +18,7 @@ from warpfiber.laws.capsule_patch import (
     make_capsule_patch,
 )
 from warpfiber.model import precision
-from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.bond_groups import bond_group_struct, pair_group_struct
 from warpfiber.passes.pairs import END_TOLERANCE
 from warpfiber.passes.ring_nodes import make_ring_nodes
 
@@ -33,9 +33,9 @@ def make_capsule_touch(name: str, closed: bool = False):
     """
     p = precision(name)
     real, vec2, vec3, vec4 = p.real, p.vec2, p.vec3, p.vec4
-    BondGroup = bond_group_struct(name)
+    BondGroup, PairGroup = bond_group_struct(name), pair_group_struct(name)
     has_before, has_after, _, _, _, _ = make_ring_nodes(closed)
-    curvatures, hertz_factor = make_capsule_contact(name)
+    _, hertz_factor = make_capsule_contact(name)
     side_share, tip_share = make_capsule_patch(name)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     near, least_sine2, both_ways = (
@@ -44,14 +44,9 @@ def make_capsule_touch(name: str, closed: bool = False):
         real(BOTH_WAYS),
     )
     turning2, tiny = real(TURNING_SINE**2), real(1.0e-30)
+    by_least = real(SMALLEST_SINE**-2)
     parallel2 = real(PARALLEL[name] ** 2)
     two_thirds, two_fifths = real(2.0 / 3.0), real(0.4)
-
-    @wp.func
-    def tip_factor(ends: wp.int32, ra: real, rb: real) -> real:
-        """f of tips."""
-        sp = curvatures(ends, ra, rb, one)
-        return hertz_factor(sp)[0] * wp.sqrt(ra * rb / sp[1])
 
     @wp.func
     def is_tip(g: BondGroup, at: wp.int32, s: real) -> wp.bool:
@@ -63,6 +58,7 @@ def make_capsule_touch(name: str, closed: bool = False):
 
     @wp.func
     def normal_contact(
+        g: PairGroup,
         gi: BondGroup,
         gj: BondGroup,
         at_i: wp.int32,
@@ -74,8 +70,7 @@ def make_capsule_touch(name: str, closed: bool = False):
         gap: vec3,
     ):
         """Of segments nearest at st, within reach there; gap from the point of i to that of j."""
-        reach = gi.radius + gj.radius
-        modulus = one / (gi.compliance + gj.compliance)
+        reach = g.reach
         la = wp.length(a)
         lb = wp.length(b)
         by_both = one / (la * lb)
@@ -86,11 +81,16 @@ def make_capsule_touch(name: str, closed: bool = False):
         signed = wp.dot(along_a, along_b)
         cosine = wp.min(wp.abs(signed), one)
         cross2 = wp.length_sq(wp.cross(along_a, along_b))
-        sine2 = wp.max(cross2, least_sine2)
-        form = hertz_factor(curvatures(0, gi.radius, gj.radius, sine2))
-        rigidity = modulus * form[0]
+        form = hertz_factor(g.crossed * wp.max(cross2, least_sine2))
+        rigidity = g.stiffness * form[0]
+        forward = signed >= zero
+        across_b = wp.where(forward, one, -one) * along_b
+        w = across_b - along_a
+        # 1 / (1 + cosine), 1 / w^2, 1 / sin^2 by one division
+        ww = wp.max(wp.dot(w, w), parallel2)
+        by_ends = one / ((one + cosine) * ww)
         # a wider angle stores less: d ln P = -2 cos d cos / sin^2
-        angle = wp.where(cross2 > turning2, signed / sine2, zero)
+        angle = wp.where(cross2 > turning2, two * signed * by_ends, zero)
         twist = -two * form[1] * angle
         inside = wp.min(wp.min(st[0], one - st[0]) * la, wp.min(st[1], one - st[1]) * lb)
         # half of the patch along either fiber is its root
@@ -99,7 +99,8 @@ def make_capsule_touch(name: str, closed: bool = False):
         if inside2 > patch2 and inside > near * wp.max(la, lb):
             distance = wp.length(gap)
             depth = wp.max(reach - distance, zero)
-            stiffness = two * rigidity * wp.sqrt(depth / sine2)
+            by_sine2 = wp.where(cross2 > least_sine2, two * by_ends, by_least)
+            stiffness = two * rigidity * wp.sqrt(depth * by_sine2)
             size = two_thirds * stiffness * depth
             energy = two_fifths * size * depth
             twist *= energy
@@ -114,69 +115,61 @@ def make_capsule_touch(name: str, closed: bool = False):
             )
 
         twist -= angle  # of the way across
-        energy = zero
-        stiffness = zero
-        damped = zero
-        s = zero
-        t = zero
-        deep = zero
-        by_delta = vec3(zero, zero, zero)
-        by_a = vec3(zero, zero, zero)
-        by_b = vec3(zero, zero, zero)
-        forward = signed >= zero
-        across_b = wp.where(forward, one, -one) * along_b
-        w = across_b - along_a
-        # 1 / (1 + cosine), 1 / w^2; slices the other way have e and w in each other's place
-        ww = wp.max(wp.dot(w, w), parallel2)
-        by_ends = one / ((one + cosine) * ww)
         wider = by_ends * ww
         by_ww = by_ends * (one + cosine)
-        ways = wp.where(cosine >= both_ways, 1, 2)
-        weight = wp.where(ways == 1, one, half + cosine)
-        for way in range(ways):
-            sigma = wp.where(forward, one, -one)
-            leading = zero
-            if ways == 2:
-                leading = one / weight
+        first = wp.where(cosine >= both_ways, one, half + cosine)
+        leading = zero
+        if cosine < both_ways:
+            leading = one / first
+        sigma = wp.where(forward, one, -one)
+        energy, stiffness, damped, s, t, deep, by_delta, by_a, by_b = side_share(
+            delta,
+            along_a,
+            across_b,
+            la,
+            lb,
+            by_la,
+            sigma * by_lb,
+            reach,
+            first * rigidity,
+            wider,
+            by_ww,
+            leading,
+            forward,
+        )
+        s *= by_la
+        t *= sigma * by_lb
+        if cosine < both_ways:
+            # slices the other way have e and w in each other's place
+            rest = wp.max(one - first, tiny)
             e_more, k_more, d_more, s_more, t_more, deep_more, by_d, by_i, by_j = side_share(
                 delta,
                 along_a,
-                sigma * along_b,
+                -across_b,
                 la,
                 lb,
                 by_la,
-                sigma * by_lb,
+                -sigma * by_lb,
                 reach,
-                weight,
-                wider,
-                by_ww,
-                leading,
-                forward,
+                rest * rigidity,
+                two * by_ww,
+                half * wider,
+                one / rest,
+                not forward,
             )
-            part = one
-            if way == 1:
-                part = e_more / wp.max(energy + e_more, tiny)
             energy += e_more
+            part = e_more / wp.max(energy, tiny)
             s += part * (by_la * s_more - s)
-            t += part * (sigma * by_lb * t_more - t)
+            t -= part * (sigma * by_lb * t_more + t)
             stiffness += k_more
             damped += d_more
             deep = wp.max(deep, deep_more)
             by_delta += by_d
             by_a += by_i
             by_b += by_j
-            forward = not forward
-            weight = wp.max(one - weight, tiny)
-            before = wider
-            wider = two * by_ww
-            by_ww = half * before
-        energy *= rigidity
-        stiffness *= rigidity
-        damped *= rigidity
         twist *= energy
-        by_delta *= rigidity
-        by_a = rigidity * by_a + (twist * by_la) * (along_b - signed * along_a)
-        by_b = rigidity * by_b + (twist * by_lb) * (along_a - signed * along_b)
+        by_a += (twist * by_la) * (along_b - signed * along_a)
+        by_b += (twist * by_lb) * (along_a - signed * along_b)
 
         is_tip_i = is_tip(gi, at_i, st[0])
         is_tip_j = is_tip(gj, at_j, st[1])
@@ -184,10 +177,9 @@ def make_capsule_touch(name: str, closed: bool = False):
             tip_s = wp.where(st[0] < half, zero, one)
             tip_t = wp.where(st[1] < half, zero, one)
             if is_tip_i:
-                round = modulus * tip_factor(1, gi.radius, gj.radius)
                 start = delta - (tip_s * la) * along_a
                 e_tip, k_tip, d_tip, t_tip, deep_tip, by_d, by_j = tip_share(
-                    start, along_b, lb, reach, round
+                    start, along_b, lb, reach, g.round_i
                 )
                 if e_tip > energy:
                     energy = e_tip
@@ -200,10 +192,9 @@ def make_capsule_touch(name: str, closed: bool = False):
                     by_a = -tip_s * by_d
                     by_b = by_j
             if is_tip_j:
-                round = modulus * tip_factor(2, gi.radius, gj.radius)
                 start = -delta - (tip_t * lb) * along_b
                 e_tip, k_tip, d_tip, s_tip, deep_tip, by_d, by_i = tip_share(
-                    start, along_a, la, reach, round
+                    start, along_a, la, reach, g.round_j
                 )
                 if e_tip > energy:
                     energy = e_tip
@@ -219,8 +210,7 @@ def make_capsule_touch(name: str, closed: bool = False):
                 c = delta + (tip_t * lb) * along_b - (tip_s * la) * along_a
                 apart = wp.length(c)
                 deep_tip = wp.max(reach - apart, zero)
-                round = modulus * tip_factor(3, gi.radius, gj.radius)
-                k_tip = two * round * wp.sqrt(deep_tip)
+                k_tip = two * g.round_both * wp.sqrt(deep_tip)
                 push = two_thirds * k_tip * deep_tip
                 if two_fifths * push * deep_tip > energy:
                     energy = two_fifths * push * deep_tip

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpfiber.model import precision
-from warpfiber.passes.bond_groups import bond_group_struct
+from warpfiber.passes.bond_groups import bond_group_struct, pair_group_struct
 from warpfiber.passes.capsule_features import CapsuleFeatures
 from warpfiber.passes.capsule_touch import make_capsule_touch
 from warpfiber.passes.pairs import PairFeatures, make_pair_geometry
@@ -26,7 +26,7 @@ def make_contact_energy(name: str, features: CapsuleFeatures):
     """Kernel `contact_energy` (S, 2): what is stored in springs and in memories of friction."""
     p = precision(name)
     real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
-    BondGroup = bond_group_struct(name)
+    BondGroup, PairGroup = bond_group_struct(name), pair_group_struct(name)
     geometry = PairFeatures(repulsion=False, periodic=features.periodic)
     closest_fractions, image_shift, _, _ = make_pair_geometry(name, geometry)
     normal_contact = make_capsule_touch(name, features.closed)
@@ -38,6 +38,7 @@ def make_contact_energy(name: str, features: CapsuleFeatures):
     def contact_energy(
         offset: wp.int32,
         groups: wp.array(dtype=BondGroup),
+        pair_groups: wp.array2d(dtype=PairGroup),
         fiber_node_start: wp.array(dtype=wp.int32),
         fiber_group: wp.array(dtype=wp.int32),
         segment_node: wp.array(dtype=wp.int32),
@@ -73,12 +74,12 @@ def make_contact_energy(name: str, features: CapsuleFeatures):
             b = vec3(place[end_j] - xj)
             delta = vec3(xj - xi) + image_shift(pair_image[k], lattice[0])
             st = closest_fractions(delta, a, b)
-            reach = gi.radius + gj.radius
+            g = pair_groups[fiber_group[fiber_i], fiber_group[segment_fiber[j]]]
             c = delta + st[1] * b - st[0] * a
-            if wp.length_sq(c) >= reach * reach:
+            if wp.length_sq(c) >= g.reach * g.reach:
                 continue
             push, felt, _n, _springs, _on_i, _on_j = normal_contact(
-                gi, gj, at_i, at_j, delta, a, b, st, c
+                g, gi, gj, at_i, at_j, delta, a, b, st, c
             )
             if felt[2] <= zero:
                 continue
@@ -86,10 +87,8 @@ def make_contact_energy(name: str, features: CapsuleFeatures):
             if wp.static(has_friction):
                 if pair_step[now & 1, k] == now:
                     kept = pair_memory[now & 1, k]
-                    shear = gi.shear_compliance + gj.shear_compliance
-                    ratio = real(4.0) * (gi.compliance + gj.compliance) / shear
                     h = vec3(kept[0], kept[1], kept[2])
-                    tangential += wp.float64(half * ratio * push[1] * wp.length_sq(h))
+                    tangential += wp.float64(half * g.shear_part * push[1] * wp.length_sq(h))
         energy[i, wp.static(NORMAL)] = normal
         energy[i, wp.static(TANGENTIAL)] = tangential
 
