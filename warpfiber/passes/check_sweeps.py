@@ -22,7 +22,6 @@ from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import make_closest_points, make_wall_gap
 
-
 LOST = 1e30  # run units, and their squares: who is there is nowhere
 
 
