@@ -4,7 +4,7 @@ A fiber whose rows are out of balance is visited: each of its rows whose fault i
 the force that balances it alone. That moves its two fibers at once, and both queue up to be visited
 again. So work is spent only where forces still change: after a warm start a row is looked at twice
 or thrice, where passes over all rows (`dual_rows`) repeat for the slowest cluster. Cells of one
-part without friction: `native_row_coupling`.
+part without friction: `native_row_coupling`, of rods where all is hard: `native_rod_sweeps`.
 
 Many fibers are cut into parts, slabs of the cell across the axis along which fibers reach least.
 Parts relax their own rows side by side, then one thread all that are left, those between parts

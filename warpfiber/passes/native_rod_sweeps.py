@@ -4,6 +4,9 @@ A row reads and moves eight numbers of each of its two rods, scaled so that it n
 for both: its balance is their product, its change their multiple. So a pass over all rows costs
 little, and most are balanced after SWEEPS of them; then those that are not queue up, and after one
 is relaxed the other rows of its two rods that it put out of balance.
+Measured, us of a solve, 1000 rods with 1100 to 1250 rows, mean of strains 0-60: 194 by couplings,
+110 so; of over-relaxed sweeps one leaves 525 rows in the queue, two 308, three 168, four 100, where
+every other sweep goes backwards three 312.
 
 Source: `native_relaxation`; J S J^T = A A^T with the rows of A as below, S the mobility.
 Symbols: N = -n on i, n on j; l = 2 s - 1; p direction of the rod,
