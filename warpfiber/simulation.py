@@ -22,6 +22,7 @@ from warpfiber.methods.overdamped import Overdamped
 from warpfiber.methods.rigid_rod import RigidRod
 from warpfiber.methods.stability import StepLimit, chosen_step, step_limits
 from warpfiber.output.saved_stage import merged_arrays, read_saved_stage
+from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.layer_profile import LayerProfile
 from warpfiber.passes.measurement import Measurement
 from warpfiber.passes.nodes import TEAR_STRETCH
@@ -284,17 +285,17 @@ class Simulation:
     @property
     def step_count(self) -> int:
         """Steps taken since the start."""
-        return int(self.state.step.numpy()[0])
+        return int(host_view(self.state.step)[0])
 
     @property
     def time(self) -> float:
         """s since the start."""
-        return float(self.state.time.numpy()[0]) * self.model.units.time
+        return float(host_view(self.state.time)[0]) * self.model.units.time
 
     @property
     def strain(self) -> float:
         """Time integral of the flow's rate."""
-        return float(self.state.strain.numpy()[0])
+        return float(host_view(self.state.strain)[0])
 
     @property
     def node_pos(self) -> np.ndarray:
@@ -360,10 +361,9 @@ class Simulation:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from a snapshot exactly as the run that took it would have."""
-        state = self.state
-        state.status.fill_(0)
+        self.state.status.fill_(0)
         for name in _ARRAYS:
-            getattr(state, name).assign(arrays[name])
+            getattr(self.state, name).assign(arrays[name])
         self.method.restore(arrays)
         self.method.set_gradient()
         if self.measurement.angle is not None:

@@ -42,7 +42,7 @@ from tests.reference import unilateral as un
 from tests.reference.bead_chain import Array, shear_gradient
 from tests.reference.overdamped_step import CHI, step_sdirk2
 from tests.row_cell import RowCell
-from warpfiber.methods.contact import KEEP, KEEP_BENT, NEAR_BENT
+from warpfiber.methods.contact import KEEP, KEEP_BENT, KEEP_RODS, NEAR_BENT
 from warpfiber.placement import place_fibers
 from warpfiber.simulation import Simulation
 
@@ -150,7 +150,7 @@ def test_one_step_of_rods(meeting: Meeting, name: str) -> None:
     rods = rods_at(before.nodes, beads if name == "lengths" else 10.0)
     soft = keys.get("contact", {}).get("stiffness")
     obstacles = un.Obstacles(
-        reach=KEEP,
+        reach=KEEP_RODS,
         lattice=lattice_of(before, keys["box"]),
         walls=walls_of(keys["box"]),
         lubricated=name == "lubrication",
@@ -174,13 +174,13 @@ def test_second_linearization_of_rods(meeting: Meeting) -> None:
     sim = meeting("rigid_rod", 40, flow=AT_ORIGIN, box=WIDE, numerics=TIGHT | {"linearizations": 2})
     before = one_step(sim).at
     rods = rods_at(before.nodes, 10.0)
-    obstacles = un.Obstacles(reach=KEEP, lattice=before.lattice)
+    obstacles = un.Obstacles(reach=KEEP_RODS, lattice=before.lattice)
     first = un.step_rods(rods, GRADIENT, DT, obstacles)
     free = rr.map_rods(rods, GRADIENT, DT)
     center, axis = kicked(free, rods, first.rows, first.force, DT)
     end = snapshot(sim)
     new = rods._replace(center=center, axis=axis)
-    again = cr.rod_rows(new, KEEP, GRADIENT, end.lattice)
+    again = cr.rod_rows(new, KEEP_RODS, GRADIENT, end.lattice)
     jacobian = cr.rod_jacobian(new, again)
     gaps = np.array([row.gap for row in again])
     delassus = jacobian @ cr.rod_mobility(rods) @ jacobian.T

@@ -23,8 +23,8 @@ CPU_ONLY = {
     *("make_native_bond_sweep make_native_capsule_pairs make_native_node_sweep".split()),
     *("make_native_pair_sweep make_near_pairs make_search_kernels make_sort_kernels".split()),
     *("make_native_prune make_native_chain make_chain_relaxation make_rod_relaxation".split()),
-    *("make_native_rod_step make_native_row_fill make_native_check".split()),
     *("crew_kernels meet_kernel look_kernel stealing_kernel make_native_strays".split()),
+    *("make_native_rod_step make_native_rod_apply make_native_row_fill make_native_check".split()),
 }
 # What a flag of this name may be, where it is more than whether something is there.
 CHOICES: dict[str, set[Any]] = {

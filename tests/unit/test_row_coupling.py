@@ -18,6 +18,7 @@ from warpfiber.simulation import Simulation
 
 METHODS = ["rigid_rod", "overdamped"]
 FIBERS, TOLERANCE = 75, 1e-7
+SOFT: dict[str, Any] = {"law": "linear", "stiffness": 300.0}  # hard rows of rods: `rod_sweeps`
 
 
 @pytest.fixture
@@ -29,9 +30,11 @@ def meeting() -> Iterator[Meeting]:
         sim.close()
 
 
-def stepped(meeting: Meeting, method: str, **numerics: Any) -> Simulation:
+def stepped(
+    meeting: Meeting, method: str, tables: dict[str, Any] | None = None, **numerics: Any
+) -> Simulation:
     """A cell after some steps."""
-    sim = meeting(method, FIBERS, numerics=numerics)
+    sim = meeting(method, FIBERS, numerics=numerics, **(tables or {}))
     sim.step(12)
     return sim
 
@@ -42,9 +45,12 @@ def test_same_without_room_for_couplings(
     meeting: Meeting, monkeypatch: pytest.MonkeyPatch, method: str, precision: str
 ) -> None:
     found = []
+    tables, numerics = {}, {"precision": precision}
+    if method == "rigid_rod":
+        tables, numerics = {"contact": SOFT}, {**numerics, "contact": "penalty"}
     for room in (relaxation_launches.TOUCHES, 1, 0):
         monkeypatch.setattr(relaxation_launches, "TOUCHES", room)
-        sim = stepped(meeting, method, precision=precision)
+        sim = stepped(meeting, method, tables, **numerics)
         found.append((last_rows(sim)["force"], sim.state.node_pos.numpy().copy()))
     assert (found[0][0] > 0.0).sum() > 5
     for force, nodes in found[1:]:

@@ -275,6 +275,19 @@ def test_frozen_rods_do_not_move(start: Start) -> None:
     assert (stuck.updates, stuck.fault) == (0, 0.0)
 
 
+def test_rod_that_meets_its_own_image(start: Start) -> None:
+    """Its ends move apart by what they overlap, its middle stays."""
+    rods = Rods(start)
+    normal, overlap = np.array([0.6, 0.0, 0.8]), 0.1
+    row = FlatRow(3, 3, 0.0, 1.0, normal, -overlap)
+    got = solve_rows(rods.sim, [row], RodResponse(rods.sim.model), H)
+    first, last = got.shift.reshape(-1, 2, 3)[3]
+    assert normal @ (last - first) == pytest.approx(overlap, abs=1.01 * got.fault + 1e-12)
+    assert np.abs(first + last).max() < 1e-12
+    assert got.fault < FAULT
+    assert got.updates <= 12  # a relaxation leaves a fifth: 0.1 / 5^12 < 1e-9
+
+
 @pytest.mark.parametrize("solver", ["gradients"], indirect=True)
 def test_sums_that_are_folded(start: Start) -> None:
     """Many chunks, as on CUDA, change nothing but the rounding of the sums."""

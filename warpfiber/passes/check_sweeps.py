@@ -22,6 +22,8 @@ from warpfiber.passes.portions import PORTION, portioned
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.row_geometry import make_closest_points, make_wall_gap
 
+LOST = 1e30  # run units, and their squares: who is there is nowhere
+
 
 @dataclass(frozen=True)
 class CheckFeatures:
@@ -51,7 +53,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
     is_near_array, array_place, _ = make_array_rows(name)
     has_arrays = features.arrays
     zero = real(0.0)
-    lost = real(1e30)
+    lost = real(LOST)
     tear2 = real(TEAR_STRETCH * TEAR_STRETCH)
     periodic = features.periodic
     has_walls = any(features.walls)
@@ -103,6 +105,9 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
                 stayed = stayed and shift_again[pair_j[k]] == zero
             if stayed:
                 return
+        if wp.static(features.picked and not has_walls and not features.tears):
+            if segment_look[i] == wp.uint8(0):
+                return
         node_i = segment_node[i]
         xi = node_pos[node_i]
         a = node_pos[node_i + 1] - xi
@@ -111,7 +116,7 @@ def make_check_sweeps(name: str, features: CheckFeatures, module: str = "unique"
             rest = groups[fiber_group[segment_fiber[i]]].rest
             longest2 = tear2 * rest * rest
         is_lost = not (wp.length_sq(xi) < lost and wp.length_sq(a) < longest2)
-        if wp.static(features.picked and not has_walls):
+        if wp.static(features.picked and not has_walls and features.tears):
             if segment_look[i] == wp.uint8(0):
                 if is_lost:
                     overlap_out[i] = lost

@@ -209,6 +209,8 @@ class ContactCheck:
             state.status,
             self.overlap,
             self.overlap_partner,
+            self.crossed,
+            self.crossed_partner,
             self.segment_look,
         ]
         return [self._launch("check_pairs", native_chunks(model.segment_count), inputs, split=True)]

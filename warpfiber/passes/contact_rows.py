@@ -23,7 +23,7 @@ from warpfiber.passes.executor import Call, Launch
 from warpfiber.passes.host_arrays import host_view
 from warpfiber.passes.kernel_module import kernel_module
 from warpfiber.passes.native_row_fill import fill_pairs, make_native_row_fill
-from warpfiber.passes.native_row_slots import FIRST, LAST
+from warpfiber.passes.native_row_slots import ALONE, FIRST, LAST
 from warpfiber.passes.neighbors import NeighborList
 from warpfiber.passes.pair_motion import CHUNK_SEGMENTS, make_pair_motion, native_chunks
 from warpfiber.passes.row_count import RowFeatures, make_row_count
@@ -117,6 +117,7 @@ class ContactRows:
         self.segment_moved = wp.full(segments, real(FAR), dtype=real, device=model.device)
         fiber = model.host["segment_fiber"]
         joined = np.concatenate([[False], fiber[1:] == fiber[:-1], [False]])
+        self.alone = not joined.any()  # every segment is a fiber
         ends = FIRST * ~joined[:-1] + LAST * ~joined[1:]
         self.segment_ends = wp.array(ends, dtype=wp.uint8, device=model.device)
         self._allocate_rows(capacity or max(64, segments + min(segments, SPARE_ROWS)))
@@ -246,7 +247,8 @@ class ContactRows:
         looked_at = max((2.0 + max(self.keep, self.near_now)) * widest, wet)
         settles = min(radii) == widest and self.near_now <= NEVER and wet == 0.0
         sizes = [widest, self.keep, self.near_now, looked_at, wet]
-        return [*(real(size) for size in sizes), int(settles)]
+        alone = ALONE if settles and self.alone else int(settles)
+        return [*(real(size) for size in sizes), alone]
 
     def _carry(self) -> Launch:
         segments, native = self.model.segment_count, self.model.device.startswith("cpu")

@@ -1,7 +1,7 @@
 """Overlaps at the end of a step of many pairs at a time, for the CPU: before `check_sweeps`.
 
-Leaves to `check_segments` the segments of which a pair may have been passed through: its lines are
-no further apart than they moved.
+Leaves to `check_segments` the segments that are nowhere, and those of which a pair may have been
+passed through: its lines are no further apart than they moved.
 Source, symbols: as there; all radii are the same.
 """
 
@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from warpfiber.model import HALT, precision
+from warpfiber.passes.check_sweeps import LOST
 from warpfiber.passes.native_pair_lanes import pair_lanes
 from warpfiber.passes.pair_motion import CHUNK_SEGMENTS, STRETCH
 from warpfiber.passes.portions import portioned
@@ -20,7 +21,16 @@ TEXT = """
     for (int s = first_segment; s < last_segment; ++s) {
         segment_overlap.data[s] = T(0);
         overlap_partner.data[s] = -1;
-        segment_look.data[s] = 0;
+        segment_crossed.data[s] = 0;
+        crossed_partner.data[s] = -1;
+        const auto& x = node_pos.data[segment_node.data[s]];
+        const auto& y = node_pos.data[segment_node.data[s] + 1];
+        T size2 = T(0), length2 = T(0);
+        for (int c = 0; c < 3; ++c) {
+            size2 += x[c] * x[c];
+            length2 += (y[c] - x[c]) * (y[c] - x[c]);
+        }
+        segment_look.data[s] = !(size2 < T(LOST) && length2 < T(LOST));
     }
     int near[STRETCH + W];
     for (int begin = first; begin < last; begin += STRETCH) {
@@ -78,7 +88,8 @@ def make_native_check(
     p = precision(name)
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     text = TEXT
-    for key, value in {"SHIFTED": shifted, "AGAIN": again, "STRETCH": STRETCH}.items():
+    flags = {"SHIFTED": shifted, "AGAIN": again, "STRETCH": STRETCH, "LOST": LOST}
+    for key, value in flags.items():
         text = text.replace(key, str(value).lower())
 
     @wp.func_native(pair_lanes(name, periodic) + text)
@@ -101,6 +112,8 @@ def make_native_check(
         shift_again: wp.array(dtype=real),
         segment_overlap: wp.array(dtype=real),
         overlap_partner: wp.array(dtype=wp.int32),
+        segment_crossed: wp.array(dtype=wp.int32),
+        crossed_partner: wp.array(dtype=wp.int32),
         segment_look: wp.array(dtype=wp.uint8),
     ): ...
 
@@ -123,6 +136,8 @@ def make_native_check(
         status: wp.array(dtype=wp.int32),
         overlap_out: wp.array(dtype=real),
         overlap_partner_out: wp.array(dtype=wp.int32),
+        crossed_out: wp.array(dtype=wp.int32),
+        crossed_partner_out: wp.array(dtype=wp.int32),
         segment_look_out: wp.array(dtype=wp.uint8),
     ):
         if status[wp.static(HALT)] != 0:
@@ -150,6 +165,8 @@ def make_native_check(
             shift_again,
             overlap_out,
             overlap_partner_out,
+            crossed_out,
+            crossed_partner_out,
             segment_look_out,
         )
 

@@ -4,7 +4,7 @@ A fiber whose rows are out of balance is visited: each of its rows whose fault i
 the force that balances it alone. That moves its two fibers at once, and both queue up to be visited
 again. So work is spent only where forces still change: after a warm start a row is looked at twice
 or thrice, where passes over all rows (`dual_rows`) repeat for the slowest cluster. Cells of one
-part without friction: `native_row_coupling`.
+part without friction: `native_row_coupling`, of rods where all is hard: `native_rod_sweeps`.
 
 Many fibers are cut into parts, slabs of the cell across the axis along which fibers reach least.
 Parts relax their own rows side by side, then one thread all that are left, those between parts
@@ -264,12 +264,18 @@ PUSH_FRICTION        });
 
 
 def relaxation_text(
-    name: str, law: str, fibers: str, types: str = "", friction: str | None = None
+    name: str,
+    law: str,
+    fibers: str,
+    types: str = "",
+    friction: str | None = None,
+    hard: str = "",
 ) -> str:
     """C++ text of a stage of a solve.
 
     `fibers`: size_of, ready, push, diagonal_of and leave; `types`: of its vectors; `friction`:
-    rub_column of these fibers, where rows have friction.
+    rub_column of these fibers, where rows have friction; `hard`: all stages but BEGIN of a cell in
+    one part whose rows are neither compliant nor rub, in place of these here.
     """
     real = {"float32": "float", "float64": "double"}[precision(name).name]
     # a friction force that is not looked at again keeps the limit of an earlier normal force
@@ -285,6 +291,7 @@ def relaxation_text(
     coupled = "" if friction is not None else f"if (coupled) {{ {coupling_text()} }}"
     stages = f"""
     if (stage == {BEGIN}) {{ {BEGIN_TEXT} }}
+    {f"if (!wet && d.parts == 1 && d.node_push.shape[0] == 0) {{ {hard} }}" if hard else ""}
     if (stage == {ROWS}) {{ {ROWS_TEXT} }}
     {ADD_UP}
     const bool coupled = {str(friction is None).lower()} && d.parts == 1;
@@ -301,6 +308,7 @@ def relaxation_text(
     for key, value in {
         "REST_STAGE": REST,
         "ROWS_STAGE": ROWS,
+        "END_STAGE": END,
         "FAR": FAR,
         "NEAR": NEAR,
         "NEXT": NEXT,

@@ -4,7 +4,24 @@ Repeats the plain kernel there where no node has a load.
 Symbols: as there.
 """
 
+from warpfiber.passes.native import transpose
 from warpfiber.passes.native_pair_lanes import row_lanes
+
+# Two rows of three of every rod of a vector, where they lie in memory: eight rods at a time.
+PUT = f"""
+    typedef T H __attribute__((ext_vector_type(8)));
+    auto put = [&](T* to, const V3& first_rows, const V3& last_rows, int own) {{
+        const V* const from[6] = {{&first_rows.x, &first_rows.y, &first_rows.z,
+                                  &last_rows.x, &last_rows.y, &last_rows.z}};
+        for (int q = 0; q < W && q < own; q += 8) {{
+            H r[8] = {{}};
+            for (int n = 0; n < 6; ++n) __builtin_memcpy(r + n, (const T*)from[n] + q, sizeof(H));
+            {transpose(8, kind="H")}
+            for (int l = 0; l < 8 && q + l < own; ++l)
+                __builtin_memcpy(to + 6ll * (q + l), r + l, 6 * sizeof(T));
+        }}
+    }};
+"""
 
 TEXT = """
     auto times = [](const auto& m, const V3& v) -> V3 {
@@ -40,21 +57,11 @@ TEXT = """
         const V3 velocity = times(gradient, center - origin) + drawn;
         const V3 swung = times(turning, arm);
         const V3 swing = swung - arm * (swung.dot(arm) * inverse2);
-        const V3 found[4] = {center - arm, center + arm, velocity - swing, velocity + swing};
+        put(now + 6ll * f, center - arm, center + arm, own);
+        put(speed + 6ll * f, velocity - swing, velocity + swing, own);
         const V sum = center.dot(arm);
-        for (int l = 0; l < own; ++l) {
-            for (int n = 0; n < 2; ++n) {
-                T* const x = now + 6ll * (f + l) + 3 * n;
-                T* const v = speed + 6ll * (f + l) + 3 * n;
-                x[0] = found[n].x[l];
-                x[1] = found[n].y[l];
-                x[2] = found[n].z[l];
-                v[0] = found[2 + n].x[l];
-                v[1] = found[2 + n].y[l];
-                v[2] = found[2 + n].z[l];
-            }
-            if (!(wp::abs(sum[l]) < T(1e30))) lost = f + l;
-        }
+        const M found = sum * sum < V(T(1e30));  // not what is no number
+        for (int l = 0; l < own; ++l) lost = found[l] ? lost : f + l;
     }
     return lost;
 """
@@ -62,4 +69,4 @@ TEXT = """
 
 def rods_text(name: str) -> str:
     """The block in the given precision; it returns a rod that is nowhere, or -1."""
-    return row_lanes(name) + TEXT
+    return row_lanes(name) + PUT + TEXT

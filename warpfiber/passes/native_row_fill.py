@@ -11,7 +11,7 @@ import warp as wp
 from warpfiber.model import HALT, precision
 from warpfiber.passes.executor import Launch
 from warpfiber.passes.native_pair_lanes import pair_lanes
-from warpfiber.passes.pair_motion import CHUNK_SEGMENTS
+from warpfiber.passes.pair_motion import CHUNK_SEGMENTS, STRETCH
 from warpfiber.passes.pairs import IMAGE_BITS
 from warpfiber.passes.portions import portioned
 from warpfiber.passes.row_geometry import CROSSING, SLOTS
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 TEXT = """
     int pairs[2 * W + SLOTS], slots[2 * W + SLOTS], places[2 * W + SLOTS], held = 0;
     const T contact = T(2) * radius;
+    int last_i = -1, likely = 0;
     // where no direction is left between two points: any normal of both lines
     auto normal_of_lines = [&](const Motion& m, int l, T* n) {
         const T a[3] = {m.a.x[l], m.a.y[l], m.a.z[l]}, b[3] = {m.b.x[l], m.b.y[l], m.b.z[l]};
@@ -83,12 +84,18 @@ TEXT = """
                     + KEY_Y * (((code >> BITS) & MASK) - HALF - other[1] + mine[1])
                     + KEY_Z * (((code >> (2 * BITS)) & MASK) - HALF - other[2] + mine[2]);
             }
-            T force = T(0);
-            for (int q = carried_start.data[i]; q < carried_start.data[i + 1]; ++q)
-                if (carried_j.data[q] == j && carried_key.data[q] == key) {
-                    force = carried_force.data[q];
-                    break;
-                }
+            if (i != last_i) likely = carried_start.data[i];
+            last_i = i;
+            const int last_carried = carried_start.data[i + 1];
+            auto is_at = [&](int q) -> bool {
+                return q < last_carried && carried_j.data[q] == j && carried_key.data[q] == key;
+            };
+            // rows mostly stay in their order
+            int q = likely;
+            if (!is_at(q))
+                for (q = carried_start.data[i]; q < last_carried && !is_at(q); ++q) {}
+            const T force = q < last_carried ? carried_force.data[q] : T(0);
+            likely = q < last_carried ? q + 1 : likely;
             row_i.data[r] = i;
             row_j.data[r] = j;
             row_key.data[r] = key;
@@ -102,11 +109,18 @@ TEXT = """
             row_force.data[r] = force;
         }
     };
-    for (int i = first_segment; i < last_segment; ++i) {
-        int r = row_out_start.data[i];
-        if (r == row_out_start.data[i + 1]) continue;
-        for (int k = out_start.data[i]; k < out_start.data[i + 1]; ++k) {
-            if (pair_row_count.data[k] == 0) continue;
+    int with_rows[STRETCH + 1], of = -1, r = 0;
+    for (int begin = first; begin < last; begin += STRETCH) {
+        const int end = begin + STRETCH < last ? begin + STRETCH : last;
+        int found = 0;
+        for (int k = begin; k < end; ++k) {
+            with_rows[found] = k;
+            found += pair_row_count.data[k] == 0 ? 0 : 1;
+        }
+        for (int n = 0; n < found; ++n) {
+            const int k = with_rows[n], i = pair_i.data[k];
+            r = i == of ? r : row_out_start.data[i];
+            of = i;
             pair_row.data[k] = r;
             for (int left = pair_slots.data[k]; left; left &= left - 1) {
                 pairs[held] = k;
@@ -147,6 +161,7 @@ def make_native_row_fill(
     for key, value in {
         "CROSSING": repr(CROSSING[name]),
         "SLOTS": SLOTS,
+        "STRETCH": STRETCH,
         "MASK": (1 << IMAGE_BITS) - 1,
         "HALF": 1 << (IMAGE_BITS - 1),
         "BITS": IMAGE_BITS,
@@ -159,12 +174,11 @@ def make_native_row_fill(
 
     @wp.func_native(pair_lanes(name, periodic) + text)
     def fill_block(
-        first_segment: wp.int32,
-        last_segment: wp.int32,
+        first: wp.int32,
+        last: wp.int32,
         radius: real,
         segment_node: wp.array(dtype=wp.int32),
         segment_fiber: wp.array(dtype=wp.int32),
-        out_start: wp.array(dtype=wp.int32),
         pair_i: wp.array(dtype=wp.int32),
         pair_j: wp.array(dtype=wp.int32),
         pair_image: wp.array(dtype=wp.int32),
@@ -236,12 +250,11 @@ def make_native_row_fill(
         if row_out_start[begin] == row_out_start[end]:
             return
         fill_block(
-            begin,
-            end,
+            out_start[begin],
+            out_start[end],
             radius,
             segment_node,
             segment_fiber,
-            out_start,
             pair_i,
             pair_j,
             pair_image,

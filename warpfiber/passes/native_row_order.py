@@ -109,7 +109,7 @@ BEGIN_TEXT = """
     for (int q = 0; q < fibers; ++q) {
         const int f = d.fiber_order.data[q];
         const int weight = 1 + d.end_start.data[f + 1] - d.end_start.data[f];
-        const int p = (int)((2 * sum + weight) * d.parts / (2 * whole));
+        const int p = d.parts > 1 ? (int)((2 * sum + weight) * d.parts / (2 * whole)) : 0;
         sum += weight;
         for (int k = p; k >= 0 && d.part_start.data[k] > q; --k) d.part_start.data[k] = q;
         d.fiber_part.data[f] = p;

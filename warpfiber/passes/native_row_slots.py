@@ -16,6 +16,7 @@ from warpfiber.passes.row_geometry import CLOSER, CROSSING
 
 LOOK = 128  # among the slots of a pair
 FIRST, LAST = 1, 2  # a segment begins, ends its fiber
+ALONE = 2  # `settles` where all of them do both
 SLACK = 1e-4  # radii: where rounding may decide, the other kernel does
 
 TEXT = """
@@ -50,7 +51,25 @@ TEXT = """
             look |= apart <= T(CROSSING);
         }
         V bits = V(T(0));
-        if (settles) {
+        const T arc = widest;
+        auto size = [](V x) -> V { return __builtin_elementwise_abs(x); };
+        auto same = [&](const Place& p, const Place& q) -> M {
+            return (size(p.s - q.s) * length_a < arc) & (size(p.t - q.t) * length_b < arc);
+        };
+        if (settles == ALONE) {  // as below, where every segment begins and ends its fiber
+            M stands[3];
+            bits = close[0] ? V(T(1)) : bits;
+            for (int k = 1; k < 3; ++k) {
+                stands[k] = ~same(places[k], places[0]);
+                bits += close[k] & stands[k] ? V(T(1 << k)) : V(T(0));
+            }
+            for (int k = 3; k < 5; ++k) {
+                M made = close[k] & ~same(places[k], places[0]);
+                for (int other = 1; other < 3; ++other)
+                    made &= ~(same(places[k], places[other]) & stands[other]);
+                bits += made ? V(T(1 << k)) : V(T(0));
+            }
+        } else if (settles) {
             T flags[4][W];
             for (int l = 0; l < W; ++l) {
                 const int i = pair_i.data[pairs[l]], j = pair_j.data[pairs[l]];
@@ -72,11 +91,7 @@ TEXT = """
             }
             const M first_i = is_end[0], last_i = is_end[1];
             const M first_j = is_end[2], last_j = is_end[3];
-            const T near = T(END_TOLERANCE), arc = widest;
-            auto size = [](V x) -> V { return __builtin_elementwise_abs(x); };
-            auto same = [&](const Place& p, const Place& q) -> M {
-                return (size(p.s - q.s) * length_a < arc) & (size(p.t - q.t) * length_b < arc);
-            };
+            const T near = T(END_TOLERANCE);
             auto is_joint = [&](V s, M begins, M ends) -> M {
                 return ((s <= near) & ~begins) | ((s >= T(1) - near) & ~ends);
             };
@@ -142,16 +157,12 @@ JOINTS
             if (waits[l]) at_joints[joints++] = pairs[l];
         bits = look ? V(T(LOOK)) : bits;
         for (int l = 0; l < count; ++l) {
-            const int found = (int)bits[l];
-            if (found == 0) continue;
-            const int i = pair_i.data[pairs[l]];
+            const int found = (int)bits[l], i = pair_i.data[pairs[l]];
+            const bool looked_for = found == LOOK;
+            const int made = looked_for ? 0 : __builtin_popcount(found);
             pair_slots.data[pairs[l]] = (unsigned char)found;
-            if (found == LOOK) {
-                segment_look.data[i] = 1;
-                continue;
-            }
-            const int made = __builtin_popcount(found);
             pair_row_count.data[pairs[l]] = made;
+            segment_look.data[i] |= looked_for;
             segment_rows.data[i] += made;
         }
     };
@@ -174,6 +185,7 @@ def slots_text(name: str) -> str:
     for key, value in {
         "SLACK": repr(SLACK),
         "LOOK": str(LOOK),
+        "ALONE": str(ALONE),
         "FIRST": str(FIRST),
         "LAST": str(LAST),
         "END_TOLERANCE": repr(END_TOLERANCE[name]),

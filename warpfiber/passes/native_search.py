@@ -180,6 +180,7 @@ SEARCH = r"""
                         const F far = V::load(HALF + m) + (h + margin);
                         const unsigned bits = V::bits((cx * cx + cy * cy + cz * cz <= far * far)
                             & (lane < end - m));
+                        if (SLIDES && bits == 0) continue;  // long segments mostly pass by
                         owner[waiting] = k;
                         place[waiting] = m;
                         image[waiting] = code;
@@ -203,12 +204,12 @@ SEARCH = r"""
 _CODE = f"({NO_WRAP} + (nx) + {WRAP_Y} * (ny) + {WRAP_Z} * (nz))"
 
 
-def _search_text(periodic: tuple[bool, bool, bool], loose: bool) -> str:
+def _search_text(periodic: tuple[bool, bool, bool], loose: bool, slides: bool) -> str:
     text = SEARCH.replace("CODE(nx, ny, nz)", _CODE).replace("NO_WRAP", str(NO_WRAP))
     text = text.replace("LANES", str(LANES)).replace(
         "MASK", {8: "unsigned char", 16: "unsigned short"}[LANES]
     )
-    text = text.replace("LOOSE", str(loose).lower())
+    text = text.replace("LOOSE", str(loose).lower()).replace("SLIDES", str(slides).lower())
     text = text.replace("ROUNDING", f"{ROUNDING}f").replace("PARALLEL", f"{PARALLEL}f")
     for axis, wraps in zip("XYZ", periodic, strict=True):
         text = text.replace(f"WRAPS_{axis}", str(int(wraps)))
@@ -231,7 +232,7 @@ def make_search_kernels(name: str, features: ListFeatures, module: str = "unique
     offset_image = WRAP_Y // 2
     options = {"module": module, "enable_backward": False, "grid_stride": False}
 
-    @wp.func_native(_search_text(features.periodic, features.loose))
+    @wp.func_native(_search_text(features.periodic, features.loose, features.slides))
     def search(
         worker: wp.int32,
         workers: wp.int32,

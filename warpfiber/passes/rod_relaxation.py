@@ -14,6 +14,7 @@ import warp as wp
 
 from warpfiber.model import HALT, precision
 from warpfiber.passes.native_relaxation import BEGIN, relaxation_text
+from warpfiber.passes.native_rod_sweeps import sweeps_text
 from warpfiber.passes.relaxation_work import make_relaxation_begin, relaxation_struct
 
 ROD_NUMBERS = 6  # of every rod, with friction one more
@@ -25,15 +26,18 @@ RODS = """
     Rod* const rods = (Rod*)rod_numbers.data;
     auto size_of = [](int) -> int { return MOTION; };
     auto dot = [](Q a, Q b) -> T { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; };
-    auto ready = [&](int f) {
-        const auto& g = d.groups.data[d.fiber_group.data[f]];
+    auto axis_of = [&](int f) -> Q {
         const auto& x0 = d.node_start.data[2 * f];
         const auto& x1 = d.node_start.data[2 * f + 1];
         const Q axis = {x1[0] - x0[0], x1[1] - x0[1], x1[2] - x0[2], T(0)};
+        return axis * (T(1) / wp::sqrt(dot(axis, axis)));
+    };
+    auto ready = [&](int f) {
+        const auto& g = d.groups.data[d.fiber_group.data[f]];
         const T beads = g.spacing + T(1), reach = T(0.5) * g.rest, dt = T(step_size.data[0]);
         const T weight = g.weight + T(2) * g.weight_excess;
         const T turning = g.torque * (T(0.25) * beads * (beads * beads - T(1)) + weight);
-        rods[f].axis = axis * (T(1) / wp::sqrt(dot(axis, axis)));
+        rods[f].axis = axis_of(f);
         rods[f].push = dt / (g.drag * beads);
         rods[f].twist = dt * reach * reach / turning;
 SET_FRICTION    };
@@ -106,16 +110,18 @@ def make_rod_relaxation(name: str, law: str, module: str = "unique", friction: b
         "SET_FRICTION": "rods[f].roll = dt / (g.torque * weight);\n" if friction else "",
     }
     rods, rubs = RODS, FRICTION.replace("MOTION", str(MOTION)) if friction else None
+    hard = sweeps_text() if law == "hard" and not friction else ""
     for key, value in parts.items():
         rods = rods.replace(key, value)
 
-    @wp.func_native(relaxation_text(name, law, rods, friction=rubs))
+    @wp.func_native(relaxation_text(name, law, rods, friction=rubs, hard=hard))
     def relax_rods(
         stage: wp.int32,
         part: wp.int32,
         d: Relaxation,
         step_size: wp.array(dtype=wp.float64),
         rod_numbers: wp.array(dtype=precision(name).real),
+        row_sweeps: wp.array(dtype=precision(name).real),
     ): ...
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False)
@@ -125,6 +131,7 @@ def make_rod_relaxation(name: str, law: str, module: str = "unique", friction: b
         d: Relaxation,
         step_size: wp.array(dtype=wp.float64),
         rod_numbers: wp.array(dtype=precision(name).real),
+        row_sweeps: wp.array(dtype=precision(name).real),
     ):
         if stage == wp.static(BEGIN):
             begin_solve(d)
@@ -132,6 +139,6 @@ def make_rod_relaxation(name: str, law: str, module: str = "unique", friction: b
             return
         if d.row_count[0] == 0 or d.row_count[0] > d.row_i.shape[0]:
             return
-        relax_rods(stage, wp.tid() + offset, d, step_size, rod_numbers)
+        relax_rods(stage, wp.tid() + offset, d, step_size, rod_numbers, row_sweeps)
 
     return rod_relax

@@ -18,8 +18,12 @@ from warpfiber.laws.rod_mobility import make_rod_mobility
 from warpfiber.model import HALT, Model, precision
 from warpfiber.passes.dual_rows import DONE, NEXT_PHASE
 from warpfiber.passes.executor import Call, Launch
+from warpfiber.passes.kernel_module import kernel_module
+from warpfiber.passes.native_rod_apply import make_native_rod_apply
+from warpfiber.passes.native_rod_sweeps import SWEEP_NUMBERS
 from warpfiber.passes.precision import group_struct
 from warpfiber.passes.relaxation_launches import relaxation_launches, relaxation_work
+from warpfiber.passes.rigid_rods import CHUNK
 from warpfiber.passes.rod_relaxation import MOTION, ROD_NUMBERS, make_rod_relaxation
 from warpfiber.passes.rub_response import rod_rub, rub_clear
 from warpfiber.passes.unilateral import ContactDual
@@ -194,7 +198,9 @@ class RodResponse:
         numbers = (ROD_NUMBERS + dual.rubs) * model.fiber_count
         rods = wp.zeros(numbers, dtype=model.precision.real, device=model.device)
         kernel = make_rod_relaxation(model.precision.name, dual.law.kind, dual.module, dual.rubs)
-        return [*relaxation_launches(kernel, work, [dual.step_size, rods])]
+        swept = SWEEP_NUMBERS * work.row_queue.shape[0]  # where there is one part
+        row_sweeps = wp.zeros(swept, dtype=model.precision.real, device=model.device)
+        return [*relaxation_launches(kernel, work, [dual.step_size, rods, row_sweeps])]
 
     def apply(self, dual: ContactDual, carried: float = 0.0) -> Launch:
         """Moves the rods by the solution."""
@@ -210,5 +216,8 @@ class RodResponse:
             state.node_velocity,
             dual.segment_shift,
         ]
-        kernel = make_rod_apply(model.precision.name, dual.module)
-        return Launch("rod_apply", kernel, model.fiber_count, inputs, split=True)
+        name, rods = model.precision.name, model.fiber_count
+        if model.device.startswith("cpu") and rods >= CHUNK:
+            native = make_native_rod_apply(name, kernel_module("rod_lanes", name))
+            return Launch("rod_apply", native, (rods + CHUNK - 1) // CHUNK, inputs, split=True)
+        return Launch("rod_apply", make_rod_apply(name, dual.module), rods, inputs, split=True)
