@@ -39,7 +39,7 @@ from warpfiber.scene import Fault, Scene, SceneError
 KEEP = 0.3
 # The same of rods, which contact moves by less: an eighth fewer rows and a fifth fewer lists than
 # with 0.3. Of three starts of a cell of 1000 (r_f = 20, steps of 0.05 to strain 60) 1, 6 and 11 of
-# 1200 steps are taken again, with 0.3 as many as 3, 2 and 10.
+# 1200 steps are taken again, with 0.3 it is 3, 2 and 10.
 KEEP_RODS = 0.2
 # Radii: the same in a cell whose fibers are bent from the start, as packed ones are. Others hold
 # them, and where a contact opens or closes they move on by more.
